@@ -1,0 +1,1 @@
+"""UAV formation flight among obstacles with uncertain navigation."""

@@ -1,0 +1,306 @@
+"""Truth lives here: swept clearance, contacts, formation error, and the statistics of many runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.formation import PathFrame, formation_offsets
+from napf_mpc.jit import compiled
+from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.planner import Command
+from napf_mpc.problem import Problem
+from napf_mpc.simulate import POSITION, Flight, Mask, Scenario, formation_mission
+from napf_mpc.world.sweep import SweptClearance, swept_separation
+
+Array = NDArray[np.float64]
+
+SETTLED_S = 12.0
+"""Formation errors count from here on: before, the formation takes shape from its take-off places."""
+APART_S = 5.0
+"""Separation counts from here on: the paper's take-off places are 1.4 m apart."""
+REFORMED_S = 1.0
+"""A formation is re-formed once its shape error has stayed under the bound for this long."""
+
+
+class Outcome(StrEnum):
+    """How a mission ended. Decided in the order failed, collided, the rest; all counts sum to N."""
+
+    REACHED = "reached"
+    COLLIDED = "collided"
+    HELD = "held"
+    ABORTED = "aborted"
+    TIMEOUT = "timeout"
+    FAILED = "failed"
+
+
+METRICS = (
+    "path_rms_m",
+    "shape_rms_m",
+    "shape_floor_m",
+    "path_length_ratio",
+    "control_effort",
+    "reform_time_s",
+    "finish_time_s",
+    "min_clearance_m",
+    "min_separation_m",
+)
+"""Metrics of a run, in the order of every table."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Verdicts and metrics of each run of a block, on the truth."""
+
+    runs: NDArray[np.int64]
+    """(run,) index in the campaign."""
+    outcome: tuple[Outcome, ...]
+    """(run,)."""
+    obstacle_contact: NDArray[np.bool_]
+    """(run, uav) whether the UAV touched an obstacle."""
+    uav_contact: NDArray[np.bool_]
+    """(run,) whether two UAVs came closer than the least separation."""
+    joint_success: NDArray[np.bool_]
+    """(run,) reached, no contact of either kind, and re-formed."""
+    finished: NDArray[np.bool_]
+    """(run,) every UAV passed the mission's length in time, contacts or not."""
+    metrics: dict[str, Array]
+    """Name -> (run,); NaN where the metric is not defined, such as a finish time without a finish."""
+
+
+class MissionScore:
+    """Observer that judges every run of a block.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation mission, sizes and bounds.
+    scenario : Scenario
+        Its obstacles are the solids of the verdict.
+    """
+
+    def __init__(self, problem: Problem, scenario: Scenario) -> None:
+        mission = formation_mission(problem)
+        self._problem = problem
+        self._scenario = scenario
+        self._frame = PathFrame.of_mission(mission)
+        self._offsets = formation_offsets(problem.formation)
+        runs, uavs = scenario.initial_state.shape[:2]
+        self._clearance = SweptClearance(scenario.obstacles, runs, uavs)
+        self._separation = np.full((runs, uavs), np.inf)
+        self._flown = np.zeros((runs, uavs))
+        self._start = self._frame.along_track(scenario.initial_state[..., POSITION])
+        self._end = self._start.copy()
+        self._sums = np.zeros((runs, 5))
+        self._below_since = np.full(runs, np.nan)
+        self._passed_at = np.full(runs, np.nan)
+        self._reform_time = np.full(runs, np.nan)
+        self._last_obstacle = self._last_obstacle_along()
+
+    def _last_obstacle_along(self) -> Array:
+        """Along-track coordinate (run,) where the last obstacle in the formation's corridor ends; NaN if none."""
+        half_width = float(np.abs(self._offsets[:, 1]).max()) + self._problem.planner.influence_m
+        length = formation_mission(self._problem).length_m
+        out = np.full(len(self._scenario.runs), np.nan)
+        for scene in range(self._scenario.obstacles.n_scenes):
+            low, high = self._scenario.obstacles.scene(scene).bounds()
+            if len(low) == 0:
+                continue
+            corners = np.stack(
+                [np.where(np.array(pick, dtype=bool), low, high) for pick in np.ndindex(2, 2, 2)], axis=0
+            )
+            # An endless cylinder has no height; only its place along and across the path counts.
+            path = self._frame.to_path(np.where(np.isfinite(corners), corners, self._frame.origin[2]))
+            inside = (path[..., 1].min(0) <= half_width) & (path[..., 1].max(0) >= -half_width)
+            inside &= (path[..., 0].min(0) <= length) & (path[..., 0].max(0) >= 0.0)
+            if inside.any():
+                far = float(path[..., 0].max(0)[inside].max())
+                if self._scenario.obstacles.n_scenes == 1:
+                    out[:] = far
+                else:
+                    out[scene] = far
+        return out
+
+    def moved(self, time_s: float, before: Array, after: Array, active: Mask) -> None:
+        """Sweep one physics step against the solids and the other UAVs."""
+        p0 = np.ascontiguousarray(before[..., POSITION])
+        p1 = np.ascontiguousarray(after[..., POSITION])
+        self._clearance.update(p0, p1, active)
+        if time_s > APART_S and p0.shape[1] > 1:
+            nearest = swept_separation(p0, p1)
+            np.minimum(self._separation, nearest, out=self._separation, where=active[:, None])
+        step = p1 - p0
+        length = np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2 + step[..., 2] ** 2)
+        self._flown += np.where(active[:, None], length, 0.0)
+        self._end = np.where(active[:, None], self._frame.along_track(p1), self._end)
+
+    def ticked(
+        self, time_s: float, state: Array, nav: NavSolution, command: Command, inputs: Array, active: Mask
+    ) -> None:
+        """Add one tick to formation errors and effort."""
+        _accumulate(
+            time_s,
+            1.0 / self._problem.simulation.controller_rate_hz,
+            state,
+            nav.position,
+            inputs,
+            active,
+            self._frame.origin,
+            self._frame.axes,
+            self._offsets,
+            self._problem.vehicle.mass_kg * 9.81,
+            formation_mission(self._problem).reform_bound_m,
+            self._last_obstacle,
+            self._sums,
+            self._below_since,
+            self._passed_at,
+            self._reform_time,
+        )
+
+    def score(self, flight: Flight) -> Score:
+        """Verdicts and metrics once the block has flown."""
+        vehicle = self._problem.vehicle
+        obstacle = self._clearance.contact(vehicle.radius_m)
+        separation = self._separation.min(-1)
+        uav = separation < vehicle.min_separation_m
+        collided = obstacle.any(-1) | uav
+        outcome = tuple(
+            Outcome.FAILED
+            if failed
+            else Outcome.COLLIDED
+            if hit
+            else Outcome.REACHED
+            if reached
+            else Outcome.HELD
+            if held
+            else Outcome.TIMEOUT
+            for failed, hit, reached, held in zip(
+                flight.failed, collided, flight.reached, flight.holding, strict=True
+            )
+        )
+        counted = self._sums[:, _COUNT]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            progress = (self._end - self._start).mean(-1)
+            metrics = {
+                "path_rms_m": np.sqrt(self._sums[:, _PATH] / counted),
+                "shape_rms_m": np.sqrt(self._sums[:, _SHAPE] / counted),
+                "shape_floor_m": np.sqrt(self._sums[:, _FLOOR] / counted),
+                "path_length_ratio": np.where(progress > 0.0, self._flown.mean(-1) / progress, np.nan),
+                "control_effort": self._sums[:, _EFFORT].copy(),
+                "reform_time_s": self._reform_time.copy(),
+                "finish_time_s": flight.finish_time_s.copy(),
+                "min_clearance_m": _finite_or_nan(self._clearance.clearance.min(-1) - vehicle.radius_m),
+                "min_separation_m": _finite_or_nan(separation),
+            }
+        for values in metrics.values():
+            values[flight.failed] = np.nan
+        reformed = np.isfinite(self._reform_time) | np.isnan(self._last_obstacle)
+        return Score(
+            np.arange(self._scenario.runs.start, self._scenario.runs.stop),
+            outcome,
+            obstacle,
+            uav,
+            flight.reached & ~collided & ~flight.failed & reformed,
+            flight.reached & ~flight.failed,
+            metrics,
+        )
+
+
+def _finite_or_nan(values: Array) -> Array:
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+_COUNT, _PATH, _SHAPE, _FLOOR, _EFFORT = 0, 1, 2, 3, 4
+
+
+@compiled
+def _accumulate(
+    time_s: float,
+    period_s: float,
+    state: Array,
+    estimate: Array,
+    inputs: Array,
+    active: NDArray[np.bool_],
+    origin: Array,
+    axes: Array,
+    offsets: Array,
+    weight: float,
+    reform_bound_m: float,
+    last_obstacle: Array,
+    sums: Array,
+    below_since: Array,
+    passed_at: Array,
+    reform_time: Array,
+) -> None:
+    """Add one tick of every active run to its sums (see the metrics of :class:`MissionScore`)."""
+    runs, uavs = state.shape[0], state.shape[1]
+    slot_error = np.empty((uavs, 3))
+    nav_error = np.empty((uavs, 3))
+    common = np.empty(3)
+    common_nav = np.empty(3)
+    for r in range(runs):
+        if not active[r]:
+            continue
+        centre = 0.0
+        rear = np.inf
+        for i in range(uavs):
+            for a in range(3):
+                projected = 0.0
+                missed = 0.0
+                for b in range(3):
+                    place = state[r, i, 2 * b]
+                    projected += (place - origin[b]) * axes[a, b]
+                    missed += (estimate[r, i, b] - place) * axes[a, b]
+                slot_error[i, a] = projected
+                nav_error[i, a] = missed
+            centre += slot_error[i, 0]
+            rear = min(rear, slot_error[i, 0])
+            thrust = inputs[r, i, 0] - weight
+            effort = thrust * thrust
+            for j in range(1, 4):
+                effort += inputs[r, i, j] * inputs[r, i, j]
+            sums[r, _EFFORT] += effort * period_s
+        centre /= uavs
+        for i in range(uavs):
+            slot_error[i, 0] -= centre + offsets[i, 0]
+            slot_error[i, 1] -= offsets[i, 1]
+            slot_error[i, 2] -= offsets[i, 2]
+        path = 0.0
+        shape = 0.0
+        floor = 0.0
+        for a in range(3):
+            common[a] = 0.0
+            common_nav[a] = 0.0
+            for i in range(uavs):
+                common[a] += slot_error[i, a]
+                common_nav[a] += nav_error[i, a]
+            common[a] /= uavs
+            common_nav[a] /= uavs
+        worst = 0.0
+        for i in range(uavs):
+            own = 0.0
+            for a in range(3):
+                path += slot_error[i, a] ** 2
+                own += (slot_error[i, a] - common[a]) ** 2
+                floor += (nav_error[i, a] - common_nav[a]) ** 2
+            shape += own
+            worst = max(worst, own)
+        if time_s >= SETTLED_S:
+            sums[r, _COUNT] += 1.0
+            sums[r, _PATH] += path / uavs
+            sums[r, _SHAPE] += shape / uavs
+            sums[r, _FLOOR] += floor / uavs
+        if worst < reform_bound_m * reform_bound_m:
+            if np.isnan(below_since[r]):
+                below_since[r] = time_s
+        else:
+            below_since[r] = np.nan
+        if np.isnan(passed_at[r]) and rear >= last_obstacle[r]:
+            passed_at[r] = time_s
+        if np.isnan(reform_time[r]) and not np.isnan(passed_at[r]) and not np.isnan(below_since[r]):
+            since = max(below_since[r], passed_at[r])
+            if time_s - since >= REFORMED_S - 1e-9:
+                reform_time[r] = since - passed_at[r]

@@ -1,0 +1,65 @@
+"""A position fix of every UAV: the true error in it, and what navigation reports about that error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["COAST_SIGMA_MPS", "Fix", "PositionErrors", "coasting_variance", "diagonal"]
+
+Array = NDArray[np.float64]
+
+COAST_SIGMA_MPS = 0.1
+"""Growth of the reported sigma of each axis while there is no fix [m/s].
+
+Without fixes a UAV integrates the last velocity that it knew. A low-cost urban receiver reports that
+velocity to 0.10 m/s (sdvn, sdve of the Nagoya log), and an error of velocity grows in proportion to time.
+"""
+
+
+@dataclass(frozen=True)
+class Fix:
+    """One epoch of the position errors of all UAVs of all runs.
+
+    While a UAV is without a fix, its error stays what it was in the last fix, and the reported covariance
+    grows by ``(COAST_SIGMA_MPS * age)**2`` on each axis. The arrays are read-only.
+    """
+
+    error: Array
+    """(run, uav, 3) to add to the true position [m]; ``error_scale`` is in it."""
+    covariance: Array
+    """(run, uav, 3, 3) as reported [m^2]; ``reported_sigma_scale`` is in it."""
+    common_factor: Array
+    """(run, uav, 3, rank) L of the part that UAVs share, as reported [m]: Sigma_ij = L_i L_j^T for i != j."""
+    available: NDArray[np.bool_]
+    """(run, uav): whether there is a fix at this epoch."""
+
+    def __post_init__(self) -> None:
+        for array in (self.error, self.covariance, self.common_factor, self.available):
+            array.flags.writeable = False
+
+
+class PositionErrors(Protocol):
+    """Position errors of a block of runs, epoch by epoch, drawn beforehand."""
+
+    @property
+    def period_s(self) -> float:
+        """Time between two epochs [s]."""
+
+    def fix(self, epoch: int) -> Fix:
+        """Return the fix of an epoch; epoch 0 is at t = 0."""
+
+
+def coasting_variance(age_s: Array) -> Array:
+    """Variance that a time without a fix adds to each axis [m^2], any shape."""
+    return (COAST_SIGMA_MPS * age_s) ** 2
+
+
+def diagonal(values: Array) -> Array:
+    """Diagonal matrices (..., n, n) with the given diagonals (..., n)."""
+    out = np.zeros((*values.shape, values.shape[-1]))
+    np.einsum("...ii->...i", out)[...] = values
+    return out

@@ -1,0 +1,64 @@
+"""What navigation tells a planner. The truth is not in here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NavSolution:
+    """One navigation solution of every UAV of every run, as reported.
+
+    A planner receives this type and the map, and nothing else, so it cannot peek at the truth.
+    """
+
+    time_s: float
+    """Time since the start of the mission [s]."""
+    available: NDArray[np.bool_]
+    """(run, uav): whether there is a position fix now; without one the position is carried on."""
+    position: Array
+    """(run, uav, 3) east, north, up [m]."""
+    velocity: Array
+    """(run, uav, 3) [m/s]."""
+    attitude: Array
+    """(run, uav, 3) roll, pitch, yaw [rad]."""
+    body_rates: Array
+    """(run, uav, 3) rates of roll, pitch, yaw [rad/s]."""
+    covariance: Array
+    """(run, uav, 6, 6) of position and velocity, as reported [m^2, m^2/s, m^2/s^2]."""
+    common_factor: Array
+    """(run, uav, 3, rank) factor L of the part that UAVs share: Sigma_ij = L_i L_j^T [m]."""
+
+    @property
+    def position_covariance(self) -> Array:
+        """(run, uav, 3, 3) reported covariance of the position [m^2]."""
+        return self.covariance[..., :3, :3]
+
+    def relative_covariance(self, i: int, j: int) -> Array:
+        """Covariance of the position of UAV i relative to UAV j: Sigma_i + Sigma_j - Sigma_ij - Sigma_ij^T.
+
+        Returns
+        -------
+        array, shape (run, 3, 3)
+            As reported [m^2]. Nearby receivers share part of their error, which drops out.
+        """
+        cross = np.einsum("rak,rbk->rab", self.common_factor[:, i], self.common_factor[:, j])
+        sigma = self.position_covariance
+        return sigma[:, i] + sigma[:, j] - cross - cross.transpose(0, 2, 1)
+
+    def trusted(self) -> NDArray[np.bool_]:
+        """(run, uav): a fix is there, all numbers are finite, and every position variance is positive.
+
+        A variance of zero, a negative one or NaN means "unknown", never "certain": such a solution is not
+        to be planned with.
+        """
+        finite = np.isfinite(self.position).all(-1) & np.isfinite(self.velocity).all(-1)
+        finite &= np.isfinite(self.attitude).all(-1) & np.isfinite(self.body_rates).all(-1)
+        finite &= np.isfinite(self.covariance).all((-1, -2))
+        variances = np.einsum("...ii->...i", self.position_covariance)
+        return self.available & finite & (variances > 0.0).all(-1)

@@ -1,0 +1,1 @@
+"""Planners: from a navigation solution and the map to a command."""

@@ -1,0 +1,147 @@
+"""The paper's planners: velocity-update APF and NAPF over formation motion (Eq. 14-39)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc import apf
+from napf_mpc.errors import ProblemError
+from napf_mpc.formation import PathFrame, formation_offsets, reference_speed, synchronisation_error
+from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.planner import Command
+from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.safety_distance import Inflation
+from napf_mpc.world.obstacles import ObstacleSet
+
+Array = NDArray[np.float64]
+
+
+class PotentialFieldPlanner:
+    """Formation flight with a potential field whose distances are inflated by the navigation margin.
+
+    Outside the range of influence it is pure formation motion: lane, synchronised speed (Eq. 18). Inside,
+    the repulsion adds to the reference velocity (Eq. 37), the direction is held within the largest turn
+    (Eq. 39), and the path point follows the UAV, so that the lateral tracking does not fight the avoidance.
+    UAVs do not repel each other.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation, mission and planner settings.
+    inflation : Inflation
+        How k sigma enters the distance; k = 0 is the fixed safety distance.
+    name : str
+        Name in tables.
+    """
+
+    def __init__(self, problem: Problem, inflation: Inflation, name: str) -> None:
+        if not isinstance(problem.mission, FormationMission):
+            raise ProblemError("mission.kind", ['must be "formation" for this planner, not "goal"'])
+        self.problem = problem
+        self.inflation = inflation
+        self._name = name
+        self._frame = PathFrame.of_mission(problem.mission)
+        self._offsets = formation_offsets(problem.formation)
+        self._lanes = self._frame.to_world(self._offsets * np.array([0.0, 1.0, 1.0]))
+        self._obstacles = ObstacleSet.empty()
+        self._anchor: Array = np.zeros((0, 0, 3))
+        self._holding: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
+
+    @property
+    def name(self) -> str:
+        """Name in tables and files."""
+        return self._name
+
+    def reset(self, obstacles: ObstacleSet, runs: int) -> None:
+        """Take a new map and forget where UAVs were holding."""
+        self._obstacles = obstacles
+        self._anchor = np.zeros((runs, len(self._offsets), 3))
+        self._holding = np.zeros((runs, len(self._offsets)), dtype=bool)
+
+    def step(self, nav: NavSolution, time_s: float) -> Command:
+        """Command of all UAVs from the reported solution and the map."""
+        settings, mission = self.problem.planner, self.problem.mission
+        assert isinstance(mission, FormationMission)
+        trusted = nav.trusted()
+        if trusted.all():
+            position, covariance = nav.position, nav.position_covariance
+        else:
+            # A solution that is not trusted must not reach the arithmetic, where NaN would spread by u_c.
+            position = np.where(trusted[..., None], nav.position, self._lanes)
+            covariance = np.where(trusted[..., None, None], nav.position_covariance, np.eye(3))
+
+        error = synchronisation_error(self._frame.along_track(position), self._offsets[:, 0])
+        speed = reference_speed(
+            mission.speed_mps,
+            self.problem.formation.sync_gain,
+            error,
+            settings.min_speed_ratio * mission.speed_mps,
+            settings.max_speed_ratio * mission.speed_mps,
+        )
+        reference = speed[..., None] * self._frame.along
+        force, avoiding = self._repulsion(position, covariance)
+        velocity = apf.velocity_update(reference, force, settings.max_speed_ratio * mission.speed_mps)
+        direction = apf.limit_turn(
+            velocity, self._frame.along, self._frame.left, math.radians(settings.max_turn_deg)
+        )
+        size = np.sqrt(velocity[..., 0] ** 2 + velocity[..., 1] ** 2 + velocity[..., 2] ** 2)
+        command = Command(
+            position=np.where(avoiding[..., None], position, self._lanes),
+            velocity=direction * size[..., None],
+            direction=direction,
+            yaw=np.full(trusted.shape, self._frame.heading_rad),
+            holding=~trusted,
+            feedforward=np.zeros((*trusted.shape, 4)),
+        )
+        return self._hold(command, nav, trusted)
+
+    def _repulsion(self, position: Array, covariance: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Force on each UAV (run, uav, 3), and whether any obstacle is within its range (run, uav)."""
+        settings = self.problem.planner
+        reach = settings.influence_m + self.inflation.largest_margin(covariance)
+        near = self._obstacles.near(position, reach + self.problem.vehicle.radius_m)
+        margin = self.inflation.margin(covariance, near.gradient)
+        rho, influence = self.inflation.apply(
+            near.distance - self.problem.vehicle.radius_m, margin, settings.influence_m
+        )
+        force = apf.repulsive_force(
+            rho, near.gradient, settings.repulsive_gain, influence, settings.min_distance_m
+        )
+        return force, (rho < influence).any(-1)
+
+    def _hold(self, command: Command, nav: NavSolution, trusted: NDArray[np.bool_]) -> Command:
+        """Hold the last known place where navigation is not to be trusted: never "no obstacle"."""
+        starts = ~trusted & ~self._holding
+        known = np.isfinite(nav.position).all(-1, keepdims=True)
+        self._anchor = np.where(starts[..., None] & known, nav.position, self._anchor)
+        # The newest trusted place serves a solution that is lost together with its numbers.
+        self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
+        self._holding = ~trusted
+        if trusted.all():
+            return command
+        lost = ~trusted[..., None]
+        return Command(
+            position=np.where(lost, self._anchor, command.position),
+            velocity=np.where(lost, 0.0, command.velocity),
+            direction=np.where(lost, 0.0, command.direction),
+            yaw=command.yaw,
+            holding=command.holding,
+            feedforward=command.feedforward,
+        )
+
+
+class ApfPlanner(PotentialFieldPlanner):
+    """The paper's original APF: a fixed safety distance, whatever navigation reports."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(problem, Inflation(0.0), "apf")
+
+
+class NapfPlanner(PotentialFieldPlanner):
+    """The paper's NAPF: the safety distance follows the reported navigation variance (section 3.2)."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(problem, Inflation.of_planner(problem.planner), "napf")

@@ -1,0 +1,720 @@
+"""The problem: who flies where among what, with which navigation. Pure data and its validation.
+
+A problem is read from TOML by :func:`napf_mpc.problem_file.load_problem`. Every key carries its unit, is
+limited to a range in which the equations make sense, and has a default unless it says who flies where
+among what. Unknown keys, text for numbers and numbers that are not finite are refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+__all__ = [
+    "BoxObstacle",
+    "Circle",
+    "City",
+    "ConstantBias",
+    "CylinderObstacle",
+    "EmptyWorld",
+    "Forest",
+    "Formation",
+    "FormationMission",
+    "GaussMarkov",
+    "GoalMission",
+    "InitialPosition",
+    "Lanes",
+    "Line",
+    "Listed",
+    "Mission",
+    "Navigation",
+    "ObstacleItem",
+    "ObstacleList",
+    "Planner",
+    "PrismObstacle",
+    "Problem",
+    "Recorded",
+    "Reference",
+    "Scatter",
+    "Simulation",
+    "SphereObstacle",
+    "Square",
+    "StreetCanyon",
+    "Vee",
+    "Vehicle",
+    "World",
+]
+
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
+Point2 = tuple[Coordinate, Coordinate]
+Point3 = tuple[Coordinate, Coordinate, Coordinate]
+Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
+Velocity3 = tuple[Speed, Speed, Speed]
+InitialPosition = Point3
+Size = Annotated[float, Field(ge=0.01, le=1e5)]
+Inertia = Annotated[float, Field(ge=1e-6, le=1e3)]
+StateWeight = Annotated[float, Field(ge=0.0, le=1e6)]
+InputWeight = Annotated[float, Field(ge=1e-6, le=1e6)]
+Count = Annotated[int, Field(ge=0, le=1_000_000)]
+MAX_UAVS = 4096
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(
+        strict=True,
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+        validate_default=True,
+    )
+
+
+def _ordered(low_high: tuple[float, float]) -> tuple[float, float]:
+    if low_high[0] > low_high[1]:
+        raise ValueError(f"must be [low, high] with low <= high, got [{low_high[0]:g}, {low_high[1]:g}]")
+    return low_high
+
+
+# ---------------------------------------------------------------------------------------------- vehicle
+
+
+class Vehicle(_Section):
+    """Quadrotor, its rotors and its LQR (Eq. 1-13). Defaults are the paper's."""
+
+    mass_kg: float = Field(1.0, ge=0.01, le=1000.0)
+    """Mass."""
+    inertia_kgm2: tuple[Inertia, Inertia, Inertia] = (8.1e-3, 8.1e-3, 14.2e-3)
+    """Moments of inertia about the body's x, y, z axes."""
+    arm_m: float = Field(0.24, ge=0.01, le=10.0)
+    """Distance from the centre to a rotor; not printed in the paper, enters only the mixer."""
+    lift_coefficient: float = Field(54.2e-6, ge=1e-9, le=1.0)
+    """Rotor thrust over squared speed [N s^2]."""
+    drag_coefficient: float = Field(4.2e-6, ge=1e-10, le=1.0)
+    """Rotor drag torque over squared speed [N m s^2]."""
+    thrust_to_weight: float = Field(2.2, ge=1.05, le=20.0)
+    """Largest total thrust over weight; each rotor gives a quarter of it at most and zero at least."""
+    radius_m: float = Field(0.3, ge=0.0, le=10.0)
+    """Radius of the ball that holds the UAV, for clearance and collision."""
+    min_separation_m: float = Field(0.6, ge=0.0, le=100.0)
+    """Centre distance under which two UAVs count as in contact."""
+    lqr_q_diagonal: tuple[
+        StateWeight, StateWeight, StateWeight, StateWeight, StateWeight, StateWeight,
+        StateWeight, StateWeight, StateWeight, StateWeight, StateWeight, StateWeight,
+    ] = (0.1,) * 12  # fmt: skip
+    """Diagonal of Q (Eq. 12), in the order of the state (Eq. 1)."""
+    lqr_r_diagonal: tuple[InputWeight, InputWeight, InputWeight, InputWeight] = (0.1, 10.0, 100.0, 10.0)
+    """Diagonal of R (Eq. 12), in the order of the input (Eq. 2)."""
+    max_velocity_error_mps: float = Field(2.0, ge=0.1, le=100.0)
+    """Largest velocity error that the LQR is shown; a larger one would tumble the UAV."""
+    max_position_error_m: float = Field(1.5, ge=0.1, le=1000.0)
+    """Largest position error that the LQR is shown."""
+
+
+# -------------------------------------------------------------------------------------------- formation
+
+
+class _FormationBase(_Section):
+    sync_gain: float = Field(-0.5, ge=-5.0, le=0.0)
+    """k_f of Eq. 18 [1/s]: a UAV that is ahead of its slot slows down."""
+
+
+class Square(_FormationBase):
+    """The paper's square of four, turned so that no UAV flies in another's track (Eq. 15, 17)."""
+
+    shape: Literal["square"]
+    """Name of the shape."""
+    side_m: float = Field(10.0, ge=0.1, le=1e4)
+    """Side s of the square."""
+    first_lane_m: float = Field(3.0, ge=0.0, le=1e4)
+    """Lateral place of UAV 1 (UAV 2 mirrors it); at most side / sqrt(2)."""
+
+    @model_validator(mode="after")
+    def _lane_inside_square(self) -> Square:
+        limit = self.side_m / math.sqrt(2.0)
+        if self.first_lane_m > limit:
+            raise ValueError(f"first_lane_m = {self.first_lane_m:g} must be <= side_m / sqrt(2) = {limit:g}")
+        return self
+
+
+class Line(_FormationBase):
+    """UAVs on a straight line through the formation's centre."""
+
+    shape: Literal["line"]
+    """Name of the shape."""
+    count: int = Field(4, ge=1, le=MAX_UAVS)
+    """Number of UAVs."""
+    spacing_m: float = Field(5.0, ge=0.1, le=1e4)
+    """Distance between neighbours."""
+    bearing_deg: float = Field(90.0, ge=-180.0, le=180.0)
+    """Angle of the line from the path: 90 abreast, 0 in file."""
+
+
+class Vee(_FormationBase):
+    """UAVs on a V, the leader in front."""
+
+    shape: Literal["v"]
+    """Name of the shape."""
+    count: int = Field(5, ge=1, le=MAX_UAVS)
+    """Number of UAVs."""
+    spacing_m: float = Field(5.0, ge=0.1, le=1e4)
+    """Distance between neighbours along an arm."""
+    opening_deg: float = Field(90.0, ge=10.0, le=170.0)
+    """Angle between the arms."""
+
+
+class Circle(_FormationBase):
+    """UAVs evenly on a horizontal circle."""
+
+    shape: Literal["circle"]
+    """Name of the shape."""
+    count: int = Field(6, ge=1, le=MAX_UAVS)
+    """Number of UAVs."""
+    radius_m: float = Field(8.0, ge=0.1, le=1e4)
+    """Radius of the circle."""
+    phase_deg: float = Field(0.0, ge=-360.0, le=360.0)
+    """Angle of UAV 1 from the path direction, to the left."""
+
+
+class Listed(_FormationBase):
+    """Any offsets."""
+
+    shape: Literal["list"]
+    """Name of the shape."""
+    offsets_m: Annotated[tuple[Point3, ...], Field(min_length=1, max_length=MAX_UAVS)]
+    """Offset of each UAV: along the path, to its left, up. The mean along the path is taken out."""
+
+
+Formation = Annotated[Square | Line | Vee | Circle | Listed, Field(discriminator="shape")]
+
+
+# ---------------------------------------------------------------------------------------------- mission
+
+
+class FormationMission(_Section):
+    """Fly the formation along a straight path."""
+
+    kind: Literal["formation"] = "formation"
+    """Kind of mission."""
+    length_m: float = Field(ge=1.0, le=1e5)
+    """Along-track distance from the path's start that every UAV has to pass."""
+    speed_mps: float = Field(2.0, ge=0.05, le=50.0)
+    """Reference speed V_r."""
+    heading_deg: float = Field(0.0, ge=-360.0, le=360.0)
+    """Direction of the path, counter-clockwise from east (+x)."""
+    climb_deg: float = Field(0.0, ge=-45.0, le=45.0)
+    """Climb angle of the path."""
+    start_m: Point3 = (0.0, 0.0, 0.0)
+    """Start of the path: east, north, up."""
+    initial_positions_m: tuple[Point3, ...] | None = None
+    """Where each UAV starts (east, north, up); by default in its slot."""
+    initial_velocities_mps: tuple[Velocity3, ...] | None = None
+    """Velocity each UAV starts with; by default zero."""
+    reform_bound_m: float = Field(2.0, ge=0.01, le=1e3)
+    """Shape error under which the formation counts as re-formed."""
+
+
+class GoalMission(_Section):
+    """One UAV as a point walks to a goal by the traditional potential field (Eq. 23-35), in the plane."""
+
+    kind: Literal["goal"]
+    """Kind of mission."""
+    start_m: Point2
+    """Start: east, north."""
+    goal_m: Point2
+    """Goal: east, north."""
+    step_m: float = Field(0.02, ge=1e-4, le=10.0)
+    """Length gamma of one step (Eq. 35)."""
+    attractive_gain: float = Field(2.5, ge=0.0, le=1e6)
+    """k_a of Eq. 25."""
+    arrival_m: float = Field(0.1, ge=1e-3, le=1e3)
+    """Distance to the goal that counts as arrived."""
+    max_steps: int = Field(5000, ge=1, le=1_000_000)
+    """Steps after which the walk is given up."""
+
+    @model_validator(mode="after")
+    def _reachable(self) -> GoalMission:
+        if self.arrival_m < self.step_m / 2:
+            raise ValueError(f"arrival_m = {self.arrival_m:g} must be >= step_m / 2 = {self.step_m / 2:g}")
+        return self
+
+
+Mission = Annotated[FormationMission | GoalMission, Field(discriminator="kind")]
+
+
+# ------------------------------------------------------------------------------------------------ world
+
+
+class SphereObstacle(_Section):
+    """A ball."""
+
+    shape: Literal["sphere"]
+    """Name of the shape."""
+    centre_m: Point3
+    """Centre: east, north, up."""
+    radius_m: Size
+    """Radius."""
+
+
+class CylinderObstacle(_Section):
+    """A vertical cylinder; without base and top it has no end."""
+
+    shape: Literal["cylinder"]
+    """Name of the shape."""
+    centre_m: Point2
+    """Axis: east, north."""
+    radius_m: Size
+    """Radius."""
+    base_m: Coordinate | None = None
+    """Height of the base; by default the cylinder has none."""
+    top_m: Coordinate | None = None
+    """Height of the top; by default the cylinder has none."""
+
+    @model_validator(mode="after")
+    def _upright(self) -> CylinderObstacle:
+        if self.base_m is not None and self.top_m is not None and self.top_m <= self.base_m:
+            raise ValueError(f"top_m = {self.top_m:g} must be > base_m = {self.base_m:g}")
+        return self
+
+
+class BoxObstacle(_Section):
+    """A box with vertical sides."""
+
+    shape: Literal["box"]
+    """Name of the shape."""
+    centre_m: Point3
+    """Centre: east, north, up."""
+    size_m: tuple[Size, Size, Size]
+    """Length, width, height."""
+    heading_deg: float = Field(0.0, ge=-360.0, le=360.0)
+    """Direction of its length, counter-clockwise from east."""
+
+
+class PrismObstacle(_Section):
+    """A polygon pulled up from base to top."""
+
+    shape: Literal["prism"]
+    """Name of the shape."""
+    footprint_m: Annotated[tuple[Point2, ...], Field(min_length=3, max_length=10_000)]
+    """Corners: east, north."""
+    base_m: Coordinate = 0.0
+    """Height of the base."""
+    top_m: Coordinate
+    """Height of the top."""
+
+    @model_validator(mode="after")
+    def _solid(self) -> PrismObstacle:
+        if self.top_m <= self.base_m:
+            raise ValueError(f"top_m = {self.top_m:g} must be > base_m = {self.base_m:g}")
+        x, y = zip(*self.footprint_m, strict=True)
+        twice_area = sum(x[i - 1] * y[i] - x[i] * y[i - 1] for i in range(len(x)))
+        if abs(twice_area) < 1e-6:
+            raise ValueError("footprint_m must enclose an area; its corners lie on one line")
+        return self
+
+
+ObstacleItem = Annotated[
+    SphereObstacle | CylinderObstacle | BoxObstacle | PrismObstacle, Field(discriminator="shape")
+]
+
+
+class EmptyWorld(_Section):
+    """Nothing to hit."""
+
+    kind: Literal["empty"]
+    """Kind of world."""
+
+
+class ObstacleList(_Section):
+    """Obstacles one by one."""
+
+    kind: Literal["list"]
+    """Kind of world."""
+    obstacles: Annotated[tuple[ObstacleItem, ...], Field(max_length=100_000)]
+    """The obstacles."""
+
+
+class _RandomWorld(_Section):
+    count: Count
+    """Number of obstacles."""
+    radius_m: tuple[Size, Size] = (0.5, 2.0)
+    """Smallest and largest radius, uniform between."""
+    shape: Literal["sphere", "cylinder"] = "sphere"
+    """Balls, or vertical cylinders without top (no fly-over)."""
+
+    _radius_ordered = field_validator("radius_m")(_ordered)
+
+
+class Lanes(_RandomWorld):
+    """Obstacles on the formation's lanes, one in each along-track stratum (the paper's 8)."""
+
+    kind: Literal["lanes"]
+    """Kind of world."""
+    count: Annotated[int, Field(ge=0, le=100_000)] = 8
+    """Number of obstacles, one a stratum."""
+    along_range_m: tuple[Coordinate, Coordinate] = (20.0, 100.0)
+    """Along-track range, cut into ``count`` strata."""
+    lane_jitter_m: float = Field(1.0, ge=0.0, le=1e4)
+    """Largest lateral distance from the lane, uniform."""
+    height_jitter_m: float = Field(1.0, ge=0.0, le=1e4)
+    """Largest vertical distance from the path, uniform."""
+
+    _range_ordered = field_validator("along_range_m")(_ordered)
+
+
+class Scatter(_RandomWorld):
+    """Obstacles anywhere in a box, with a least gap between them (the paper's 40)."""
+
+    kind: Literal["scatter"]
+    """Kind of world."""
+    count: Annotated[int, Field(ge=0, le=100_000)] = 40
+    """Number of obstacles."""
+    along_range_m: tuple[Coordinate, Coordinate] = (20.0, 110.0)
+    """Along-track range of the centres."""
+    lateral_range_m: tuple[Coordinate, Coordinate] = (-20.0, 20.0)
+    """Lateral range of the centres."""
+    height_range_m: tuple[Coordinate, Coordinate] = (-3.0, 3.0)
+    """Vertical range of the centres about the path."""
+    min_gap_m: float = Field(2.0, ge=0.0, le=1e4)
+    """Least gap between two surfaces, in the horizontal plane."""
+
+    _range_ordered = field_validator("along_range_m", "lateral_range_m", "height_range_m")(_ordered)
+
+
+class Forest(_Section):
+    """Tree trunks as vertical cylinders, at least a gap apart."""
+
+    kind: Literal["forest"]
+    """Kind of world."""
+    count: Annotated[int, Field(ge=0, le=100_000)] = 120
+    """Number of trees."""
+    radius_m: tuple[Size, Size] = (0.2, 0.6)
+    """Smallest and largest trunk radius."""
+    tree_height_m: tuple[Size, Size] = (8.0, 20.0)
+    """Smallest and largest height above ground."""
+    ground_m: Coordinate = 0.0
+    """Height of the ground."""
+    along_range_m: tuple[Coordinate, Coordinate] = (20.0, 110.0)
+    """Along-track range of the trees."""
+    lateral_range_m: tuple[Coordinate, Coordinate] = (-30.0, 30.0)
+    """Lateral range of the trees."""
+    min_gap_m: float = Field(3.0, ge=0.0, le=1e4)
+    """Least gap between two trunks."""
+
+    _ranges_ordered = field_validator("radius_m", "tree_height_m", "along_range_m", "lateral_range_m")(
+        _ordered
+    )
+
+
+class StreetCanyon(_Section):
+    """A synthetic street: buildings of random size on both sides, masts and bridges in it."""
+
+    kind: Literal["street_canyon"]
+    """Kind of world."""
+    street_width_m: float = Field(40.0, ge=2.0, le=1e3)
+    """Width between the building lines."""
+    building_length_m: tuple[Size, Size] = (15.0, 40.0)
+    """Smallest and largest length of a front along the street."""
+    building_height_m: tuple[Size, Size] = (15.0, 60.0)
+    """Smallest and largest height of a building."""
+    building_depth_m: float = Field(20.0, ge=1.0, le=1e3)
+    """Depth of a building away from the street."""
+    setback_m: float = Field(6.0, ge=0.0, le=1e3)
+    """Fronts stand between the building line and this far *into* the street, uniform."""
+    gap_m: float = Field(4.0, ge=0.0, le=1e3)
+    """Gap between two buildings."""
+    along_range_m: tuple[Coordinate, Coordinate] = (15.0, 115.0)
+    """Along-track range of the street."""
+    ground_m: Coordinate = 0.0
+    """Height of the ground."""
+    mast_count: Annotated[int, Field(ge=0, le=10_000)] = 6
+    """Masts that stand in the street."""
+    mast_radius_m: tuple[Size, Size] = (0.2, 0.5)
+    """Smallest and largest radius of a mast."""
+    mast_height_m: tuple[Size, Size] = (30.0, 60.0)
+    """Smallest and largest height of a mast."""
+
+    _ranges_ordered = field_validator(
+        "building_length_m", "building_height_m", "along_range_m", "mast_radius_m", "mast_height_m"
+    )(_ordered)
+
+
+class City(_Section):
+    """Buildings from a file: GeoJSON footprints with heights, or CityJSON LoD1."""
+
+    kind: Literal["city"]
+    """Kind of world."""
+    file: str = Field(min_length=1, max_length=1000)
+    """Path under the data folder; ``.geojson``, or ``.json`` / ``.city.json`` for CityJSON."""
+    origin_latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
+    """Latitude of the local frame's origin (GeoJSON; by default the middle of the buildings)."""
+    origin_longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0)] | None = None
+    """Longitude of the local frame's origin (GeoJSON)."""
+    origin_m: Point3 | None = None
+    """Origin in the file's own projected coordinates (CityJSON; by default the middle of the buildings)."""
+    height_property: str = Field("height_m", min_length=1, max_length=200)
+    """GeoJSON property that holds the height above ground."""
+    min_height_m: float = Field(0.0, ge=0.0, le=1e4)
+    """Buildings lower than this are left out (a formation that flies above them needs none)."""
+    radius_m: float = Field(5000.0, ge=1.0, le=1e5)
+    """Buildings farther than this from the origin are left out."""
+    credit: str = Field("", max_length=500)
+    """Source and licence, printed on every figure."""
+
+    @model_validator(mode="after")
+    def _both(self) -> City:
+        if (self.origin_latitude_deg is None) != (self.origin_longitude_deg is None):
+            raise ValueError("origin_latitude_deg and origin_longitude_deg go together: give both or none")
+        return self
+
+
+World = Annotated[
+    EmptyWorld | ObstacleList | Lanes | Scatter | Forest | StreetCanyon | City, Field(discriminator="kind")
+]
+
+
+# ------------------------------------------------------------------------------------------- navigation
+
+
+class _NavigationBase(_Section):
+    rate_hz: float = Field(10.0, ge=0.1, le=100.0)
+    """Rate of position fixes; each error is held between."""
+    filter: Literal["none", "kalman"] = "none"
+    """Navigation filter between the fixes and the planner."""
+    common_mode_share: float = Field(0.0, ge=0.0, le=1.0)
+    """Share of the error variance that all UAVs have in common."""
+    reported_sigma_scale: float = Field(1.0, ge=1e-3, le=1e3)
+    """What navigation claims over the truth: 0.5 reports half the true sigma."""
+    error_scale: float = Field(1.0, ge=0.0, le=100.0)
+    """Factor on the errors themselves; the reported sigma does not follow it. 0 switches the noise off."""
+
+    @field_validator("filter")
+    @classmethod
+    def _filter_exists(cls, value: str) -> str:
+        if value == "kalman":
+            raise ValueError('"kalman" is not built in this version; use "none"')
+        return value
+
+
+class GaussMarkov(_NavigationBase):
+    """Correlated errors whose sigma swings between two bounds (paper: 1-5 m on each axis)."""
+
+    kind: Literal["gauss_markov"] = "gauss_markov"
+    """Kind of navigation error."""
+    sigma_min_m: float = Field(1.0, ge=1e-3, le=1e3)
+    """Smallest sigma of an axis."""
+    sigma_max_m: float = Field(5.0, ge=1e-3, le=1e3)
+    """Largest sigma of an axis."""
+    sigma_period_s: float = Field(20.0, ge=0.1, le=1e6)
+    """Period of sigma's swing; its phase is random per UAV and axis."""
+    correlation_time_s: float = Field(10.0, ge=0.0, le=1e6)
+    """Correlation time of the error; 0 is white noise."""
+    outage_interval_s: float = Field(0.0, ge=0.0, le=1e6)
+    """Mean time between outages of a UAV's fixes (exponential); 0 for none."""
+    outage_duration_s: float = Field(5.0, ge=0.0, le=1e4)
+    """Length of an outage."""
+
+    @model_validator(mode="after")
+    def _bounds_ordered(self) -> GaussMarkov:
+        if self.sigma_min_m > self.sigma_max_m:
+            raise ValueError(
+                f"sigma_min_m = {self.sigma_min_m:g} must be <= sigma_max_m = {self.sigma_max_m:g}"
+            )
+        return self
+
+
+class ConstantBias(_NavigationBase):
+    """An error drawn once per UAV and axis and kept for the whole mission."""
+
+    kind: Literal["constant"]
+    """Kind of navigation error."""
+    sigma_min_m: float = Field(1.0, ge=1e-3, le=1e3)
+    """Smallest sigma of an axis."""
+    sigma_max_m: float = Field(5.0, ge=1e-3, le=1e3)
+    """Largest sigma of an axis; each is uniform between the two, once per UAV and axis."""
+
+    @model_validator(mode="after")
+    def _bounds_ordered(self) -> ConstantBias:
+        if self.sigma_min_m > self.sigma_max_m:
+            raise ValueError(
+                f"sigma_min_m = {self.sigma_min_m:g} must be <= sigma_max_m = {self.sigma_max_m:g}"
+            )
+        return self
+
+
+class Recorded(_NavigationBase):
+    """Errors replayed from a measured log with the covariance that it reported."""
+
+    kind: Literal["recorded"]
+    """Kind of navigation error."""
+    file: str = Field(min_length=1, max_length=1000)
+    """Path under the data folder: RTKLIB ``.pos``, or ``.csv`` with errors and covariances."""
+    truth_file: str | None = Field(None, max_length=1000)
+    """Path of the truth (``.pos``) that a ``.pos`` solution is compared with; a ``.csv`` needs none."""
+    gaps: Literal["close", "outage"] = "close"
+    """Epochs without a fix: left out, or replayed as outages."""
+    vertical: Literal["barometer", "recorded"] = "barometer"
+    """Where the height comes from: a barometer model, as on a real UAV, or the log."""
+    barometer_sigma_m: float = Field(1.0, ge=1e-3, le=1e3)
+    """Sigma of the barometer's height."""
+    barometer_correlation_time_s: float = Field(300.0, ge=0.0, le=1e6)
+    """Correlation time of the barometer's error."""
+    credit: str = Field("", max_length=500)
+    """Source and licence, printed on every figure."""
+
+
+Navigation = Annotated[GaussMarkov | ConstantBias | Recorded, Field(discriminator="kind")]
+
+
+# ------------------------------------------------------------------------------- planner and simulation
+
+
+class Planner(_Section):
+    """The planner and its potential field (Eq. 23-39, section 3.2)."""
+
+    kind: Literal["apf", "napf", "qp"] = "napf"
+    """Planner that ``run`` flies unless told otherwise."""
+    rate_hz: float = Field(10.0, ge=0.5, le=100.0)
+    """Rate at which the planner is asked."""
+    influence_m: float = Field(3.0, ge=0.01, le=1e3)
+    """rho_0: the potential field acts inside this distance (Eq. 23)."""
+    repulsive_gain: float = Field(15.0, ge=0.0, le=1e6)
+    """k_r of Eq. 23."""
+    min_distance_m: float = Field(0.1, ge=1e-3, le=1e2)
+    """Distances below this count as this in Eq. 28: the force stays finite at contact."""
+    max_turn_deg: float = Field(60.0, ge=0.0, le=90.0)
+    """Largest turn of the commanded direction against the path (Eq. 39)."""
+    min_speed_ratio: float = Field(0.2, ge=0.0, le=1.0)
+    """Least synchronised reference speed over V_r."""
+    max_speed_ratio: float = Field(1.5, ge=1.0, le=10.0)
+    """Largest commanded speed over V_r."""
+    k: Annotated[float, Field(ge=0.0, le=20.0)] | None = None
+    """Inflation in reported sigmas; 3 unless ``confidence`` is given."""
+    confidence: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
+    """Two-sided probability from which k follows: k = sqrt(2) erfinv(confidence)."""
+    inflation: Literal["shift", "range"] = "shift"
+    """k sigma shifts the distance to the obstacle, or only widens the range of influence."""
+    sigma: Literal["directional", "largest", "rms", "chi2"] = "directional"
+    """Which sigma: along the gradient, the largest axis, the root mean square; chi2 = directional with k from the 3-D chi-square law."""  # noqa: E501
+
+    @model_validator(mode="after")
+    def _one_confidence(self) -> Planner:
+        if self.k is not None and self.confidence is not None:
+            raise ValueError("exactly one of k and confidence may be given, not both")
+        if self.sigma == "chi2" and self.confidence is None:
+            raise ValueError('sigma = "chi2" needs confidence (k follows from it)')
+        if self.confidence is not None and self.confidence > 1.0 - 1e-12:
+            raise ValueError(f"confidence = {self.confidence!r} must be <= 1 - 1e-12")
+        if self.min_distance_m > self.influence_m:
+            raise ValueError(
+                f"min_distance_m = {self.min_distance_m:g} must be <= influence_m = {self.influence_m:g}"
+            )
+        return self
+
+
+class Simulation(_Section):
+    """Rates and limits of the closed loop."""
+
+    time_limit_s: float = Field(110.0, ge=0.1, le=3600.0)
+    """Mission time after which a run is over."""
+    step_s: float = Field(0.02, ge=0.001, le=0.02)
+    """Step of the RK4 integration; the truth is swept between steps."""
+    controller_rate_hz: float = Field(50.0, ge=10.0, le=1000.0)
+    """Rate of the inner loop (LQR)."""
+
+
+class Reference(_Section):
+    """Published figures that a comparison prints beside its own."""
+
+    source: str = Field(min_length=1, max_length=500)
+    """Where they were published."""
+    runs: int = Field(ge=1, le=1_000_000_000)
+    """Runs behind them."""
+    collision_risk: dict[Literal["apf", "napf", "qp"], Annotated[float, Field(ge=0.0, le=1.0)]]
+    """Planner -> published collision risk."""
+    note: str = Field("", max_length=1000)
+    """What may and may not be concluded."""
+
+
+class Problem(_Section):
+    """A whole problem file."""
+
+    title: str = Field("", max_length=200)
+    """One line for lists."""
+    description: str = Field("", max_length=10_000)
+    """What the problem is for."""
+    source: str = Field("", max_length=2000)
+    """Where its numbers come from."""
+    vehicle: Vehicle = Vehicle()
+    """The UAV."""
+    formation: Formation
+    """Who flies."""
+    mission: Mission
+    """Where to."""
+    world: World
+    """Among what."""
+    navigation: Navigation = GaussMarkov()
+    """With which navigation."""
+    planner: Planner = Planner()
+    """How it avoids."""
+    simulation: Simulation = Simulation()
+    """How it is simulated."""
+    reference: Reference | None = None
+    """Published figures to print beside the results."""
+
+    @property
+    def uav_count(self) -> int:
+        """Number of UAVs."""
+        match self.formation:
+            case Square():
+                return 4
+            case Listed():
+                return len(self.formation.offsets_m)
+            case _:
+                return self.formation.count
+
+    def digest(self) -> str:
+        """SHA-256 of everything that decides a result; words (title, description, source,
+        reference) do not count."""
+        words = {"title", "description", "source", "reference"}
+        return hashlib.sha256(self.model_dump_json(exclude=words).encode()).hexdigest()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Problem:
+        faults = [*self._initial_faults(), *self._rate_faults()]
+        if isinstance(self.mission, GoalMission) and self.uav_count != 1:
+            faults.append(f"formation has {self.uav_count} UAVs, a mission of kind goal needs exactly 1")
+        if isinstance(self.mission, GoalMission) and self.planner.kind != "apf":
+            faults.append(
+                f'planner.kind = "{self.planner.kind}", a mission of kind goal is flown by "apf" only'
+            )
+        if faults:
+            raise ValueError("; ".join(faults))
+        return self
+
+    def _initial_faults(self) -> list[str]:
+        if isinstance(self.mission, GoalMission):
+            return []
+        faults = []
+        for key in ("initial_positions_m", "initial_velocities_mps"):
+            rows = getattr(self.mission, key)
+            if rows is not None and len(rows) != self.uav_count:
+                faults.append(f"mission.{key} has {len(rows)} rows, the formation has {self.uav_count} UAVs")
+        return faults
+
+    def _rate_faults(self) -> list[str]:
+        """Each slower rate must divide the faster one, so that every loop is a whole number of steps."""
+        faults = []
+        controller_hz = self.simulation.controller_rate_hz
+        for name, fast_hz, slow_hz in (
+            ("simulation.controller_rate_hz", 1.0 / self.simulation.step_s, controller_hz),
+            ("planner.rate_hz", controller_hz, self.planner.rate_hz),
+            ("navigation.rate_hz", controller_hz, self.navigation.rate_hz),
+        ):
+            ratio = fast_hz / slow_hz
+            if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+                faults.append(f"{name} = {slow_hz:g} must divide {fast_hz:g} Hz a whole number of times")
+        return faults

@@ -1,0 +1,150 @@
+"""Safety distance from the navigation variance (section 3.2): one function for potential field and QP alike.
+
+The paper prints an error interval ``[x - k sigma, x + k sigma]`` and no formula. As read: the obstacle is
+inflated by k sigma, so the distance that enters the potential field is ``rho_eff = rho - k sigma``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from napf_mpc.problem import Planner
+
+Array = NDArray[np.float64]
+SigmaReading = Literal["directional", "largest", "rms", "chi2"]
+
+DEFAULT_K = 3.0
+"""The paper's k: 99.73 % of a normal error, two-sided, in one axis (the paper prints 99.74 %)."""
+
+
+def confidence_factor(confidence: float, dimensions: int = 1) -> float:
+    """Return k for which an error stays within k sigma with the given probability.
+
+    In one dimension k = sqrt(2) erfinv(p), two-sided normal (p = 0.9974 gives 3.01); in more, the square
+    root of the chi-square quantile, so that the whole error vector lies in the k-sigma ellipsoid.
+
+    Raises
+    ------
+    ValueError
+        If confidence is outside (0, 1) or dimensions is not a positive whole number.
+    """
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence = {confidence!r} must be > 0 and < 1")
+    if dimensions < 1:
+        raise ValueError(f"dimensions = {dimensions!r} must be >= 1")
+    return math.sqrt(2.0 * float(special.gammaincinv(dimensions / 2.0, confidence)))
+
+
+def directional_sigma(covariance: Array, normal: Array) -> Array:
+    """Standard deviation sqrt(n^T Sigma n) of the position along unit vectors n.
+
+    Parameters
+    ----------
+    covariance : array, shape (..., 3, 3)
+        Position covariance [m^2].
+    normal : array, shape (..., 3)
+        Unit vectors; leading axes broadcast against those of the covariance.
+
+    Returns
+    -------
+    array, shape (...)
+        [m].
+    """
+    c = covariance
+    x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
+    # Written out: a contraction by BLAS may differ in the last bit with the size of the batch.
+    variance = c[..., 0, 0] * x * x + c[..., 1, 1] * y * y + c[..., 2, 2] * z * z
+    variance = variance + (c[..., 0, 1] + c[..., 1, 0]) * x * y
+    variance = variance + (c[..., 0, 2] + c[..., 2, 0]) * x * z
+    variance = variance + (c[..., 1, 2] + c[..., 2, 1]) * y * z
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+def axis_sigma(covariance: Array, reading: Literal["largest", "rms"]) -> Array:
+    """Standard deviation without a direction, (...) [m]: the largest axis' or the axes' root mean square."""
+    variances = np.stack([covariance[..., 0, 0], covariance[..., 1, 1], covariance[..., 2, 2]], axis=-1)
+    if reading == "largest":
+        return np.sqrt(variances.max(-1))
+    return np.sqrt((variances[..., 0] + variances[..., 1] + variances[..., 2]) / 3.0)
+
+
+def clearance_margin(covariance: Array, normal: Array, confidence: float) -> Array:
+    r"""Distance by which an obstacle is inflated for the navigation error along one direction (section 3.2).
+
+    ``margin = k sqrt(n^T Sigma n)``, ``k = sqrt(2) erfinv(confidence)``; as read, no formula is printed.
+
+    Parameters
+    ----------
+    covariance : array, shape (..., 3, 3)
+        Position covariance as navigation reports it [m^2].
+    normal : array, shape (..., 3)
+        Unit gradient of the distance, from the obstacle to the UAV.
+    confidence : float
+        Two-sided probability in (0, 1); 0.9974 gives k = 3.01.
+
+    Returns
+    -------
+    array, shape (...)
+        Margin [m].
+
+    Raises
+    ------
+    ValueError
+        If confidence is outside (0, 1), a number is not finite, or a covariance has a negative eigenvalue.
+    """
+    factor = confidence_factor(confidence)
+    covariance = np.asarray(covariance, dtype=float)
+    normal = np.asarray(normal, dtype=float)
+    if not (np.isfinite(covariance).all() and np.isfinite(normal).all()):
+        raise ValueError("covariance and normal must be finite")
+    lowest = float(np.linalg.eigvalsh(covariance).min())
+    if lowest < -1e-9 * max(1.0, float(np.abs(covariance).max())):
+        raise ValueError(
+            f"covariance has the negative eigenvalue {lowest:g}; it must be positive semidefinite"
+        )
+    return factor * directional_sigma(covariance, normal)
+
+
+@dataclass(frozen=True)
+class Inflation:
+    """How k sigma enters the distance to an obstacle."""
+
+    k: float
+    """Inflation in sigmas; 0 is the fixed safety distance of the original APF."""
+    mode: Literal["shift", "range"] = "shift"
+    """Shift the distance (the obstacle grows), or only widen the range of influence rho_0."""
+    reading: SigmaReading = "directional"
+    """Which sigma."""
+
+    @classmethod
+    def of_planner(cls, planner: Planner) -> Inflation:
+        """Inflation as a problem's planner section asks for it."""
+        if planner.confidence is not None:
+            k = confidence_factor(planner.confidence, 3 if planner.sigma == "chi2" else 1)
+        else:
+            k = DEFAULT_K if planner.k is None else planner.k
+        return cls(k, planner.inflation, planner.sigma)
+
+    def margin(self, covariance: Array, normal: Array) -> Array:
+        """Inflation k sigma [m]: covariance (..., 3, 3) against normals (..., m, 3) gives (..., m)."""
+        if self.reading in ("largest", "rms"):
+            sigma = axis_sigma(covariance, "largest" if self.reading == "largest" else "rms")
+            return np.broadcast_to(self.k * sigma[..., None], normal.shape[:-1])
+        return self.k * directional_sigma(covariance[..., None, :, :], normal)
+
+    def largest_margin(self, covariance: Array) -> Array:
+        """Bound (...) on the margin over all directions: k times the root of the covariance's trace [m]."""
+        trace = covariance[..., 0, 0] + covariance[..., 1, 1] + covariance[..., 2, 2]
+        return self.k * np.sqrt(np.maximum(trace, 0.0))
+
+    def apply(self, distance: Array, margin: Array, influence_m: float) -> tuple[Array, Array]:
+        """Distance and range that enter Eq. 23 and 28, each (...) [m]: (rho_eff, rho_0)."""
+        if self.mode == "shift":
+            return distance - margin, np.full_like(distance, influence_m)
+        return distance, influence_m + margin

@@ -1,0 +1,276 @@
+"""The closed loop: sensors -> navigation solution -> planner -> command -> inner loop -> plant.
+
+All runs of a block fly in lock-step as arrays (run, uav). Physics is integrated every ``step_s``, the inner
+loop runs at ``controller_rate_hz``, position fixes and the planner at rates of their own. The planner is
+given navigation solutions and the map; the truth goes to observers only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.errors import ProblemError
+from napf_mpc.formation import PathFrame, formation_offsets
+from napf_mpc.navigation.error_models import Fix, PositionErrors, position_errors
+from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.planner import Command, Planner
+from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.vehicle.lqr import check_sampled_loop
+from napf_mpc.vehicle.plant import advance
+from napf_mpc.vehicle.quadrotor import parameters
+from napf_mpc.vehicle.tracking import TrackingLaw, tracking_law
+from napf_mpc.world.obstacles import ObstacleSet
+from napf_mpc.world.scenes import build_scenes
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+POSITION, VELOCITY = slice(0, 6, 2), slice(1, 6, 2)
+ATTITUDE, RATES = slice(6, 12, 2), slice(7, 12, 2)
+LOST_M = 1e7
+"""A UAV farther than this from the origin has left the range in which the numbers mean anything."""
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What chance decides for a block of runs; every planner of a comparison flies the same."""
+
+    seed: int
+    """Campaign seed."""
+    runs: range
+    """Indices of the runs in their campaign."""
+    obstacles: ObstacleSet
+    """One scene for all runs, or one a run."""
+    initial_state: Array
+    """(run, uav, 12), Eq. 1."""
+    errors: PositionErrors
+    """Navigation errors over the whole mission."""
+
+
+def formation_mission(problem: Problem) -> FormationMission:
+    """Return the problem's mission if a formation can fly it.
+
+    Raises
+    ------
+    ProblemError
+        If it is a single point's walk to a goal.
+    """
+    if not isinstance(problem.mission, FormationMission):
+        raise ProblemError(
+            "mission.kind", ['is "goal": a walk of one point; fly it with `run` or draw it with `figures`']
+        )
+    return problem.mission
+
+
+def initial_state(problem: Problem) -> Array:
+    """State (uav, 12) at the start: as given, else in the slots at rest; yaw along the path."""
+    mission = formation_mission(problem)
+    frame = PathFrame.of_mission(mission)
+    state = np.zeros((problem.uav_count, 12))
+    if mission.initial_positions_m is None:
+        state[:, POSITION] = frame.to_world(formation_offsets(problem.formation))
+    else:
+        state[:, POSITION] = mission.initial_positions_m
+    if mission.initial_velocities_mps is not None:
+        state[:, VELOCITY] = mission.initial_velocities_mps
+    state[:, 10] = frame.heading_rad
+    return state
+
+
+def build_scenario(problem: Problem, seed: int, runs: range, data_folder: Path | None = None) -> Scenario:
+    """Draw obstacles, initial state and navigation errors of some runs of a campaign.
+
+    Raises
+    ------
+    NapfError
+        If the scene cannot be built, a data file is missing, or the inner loop would be unstable.
+    """
+    mission = formation_mission(problem)
+    check_sampled_loop(problem.vehicle, 1.0 / problem.simulation.controller_rate_hz)
+    frame = PathFrame.of_mission(mission)
+    lanes = formation_offsets(problem.formation)[:, 1]
+    start = np.broadcast_to(initial_state(problem), (len(runs), problem.uav_count, 12))
+    return Scenario(
+        seed,
+        runs,
+        build_scenes(problem.world, frame, lanes, seed, runs, data_folder),
+        start.copy(),
+        position_errors(
+            problem.navigation, seed, runs, problem.uav_count, problem.simulation.time_limit_s, data_folder
+        ),
+    )
+
+
+class Observer(Protocol):
+    """Sees the truth; used by evaluation and recording, never by planners."""
+
+    def moved(self, time_s: float, before: Array, after: Array, active: Mask) -> None:
+        """See one physics step: states (run, uav, 12) at its start and end, and which runs still fly."""
+        ...
+
+    def ticked(
+        self, time_s: float, state: Array, nav: NavSolution, command: Command, inputs: Array, active: Mask
+    ) -> None:
+        """See one tick of the inner loop, before the plant moves."""
+        ...
+
+
+@dataclass(frozen=True)
+class Flight:
+    """How the runs of a block ended, on the truth."""
+
+    reached: Mask
+    """(run,) whether every UAV passed the mission's length in time."""
+    failed: Mask
+    """(run,) whether a number stopped being finite."""
+    holding: Mask
+    """(run,) whether any UAV was hovering on purpose at the end."""
+    finish_time_s: Array
+    """(run,) when the last UAV passed the mission's length; NaN if it did not [s]."""
+    duration_s: Array
+    """(run,) time flown [s]."""
+
+
+def closed_loop(
+    problem: Problem, planner: Planner, scenario: Scenario, observers: Sequence[Observer] = ()
+) -> Flight:
+    """Fly all runs of a scenario in lock-step until each is finished, failed or out of time.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation mission, rates and limits.
+    planner : Planner
+        Is reset to the scenario's map, then asked at its rate.
+    scenario : Scenario
+        Scenes, initial state and errors.
+    observers : sequence of Observer
+        See the truth.
+
+    Returns
+    -------
+    Flight
+        Per run.
+    """
+    mission = formation_mission(problem)
+    clock = _Clock.of_problem(problem, scenario.errors.period_s)
+    frame = PathFrame.of_mission(mission)
+    law = tracking_law(problem.vehicle)
+    constants = parameters(problem.vehicle)
+    state = scenario.initial_state.copy()
+    runs = len(scenario.runs)
+
+    active = np.ones(runs, dtype=bool)
+    failed = np.zeros(runs, dtype=bool)
+    holding = np.zeros(runs, dtype=bool)
+    finish_time = np.full(runs, np.nan)
+    duration = np.zeros(runs)
+    planner.reset(scenario.obstacles, runs)
+    fix = scenario.errors.fix(0)
+    covariance = _with_velocity(fix.covariance)
+    command: Command | None = None
+    for tick in range(clock.ticks):
+        time_s = tick * clock.period_s
+        if tick % clock.ticks_per_fix == 0:
+            fix = scenario.errors.fix(tick // clock.ticks_per_fix)
+            covariance = _with_velocity(fix.covariance)
+        nav = _solution(time_s, state, fix, covariance)
+        if command is None or tick % clock.ticks_per_plan == 0:
+            command = planner.step(nav, time_s)
+            holding[active] = command.holding[active].any(-1)
+        inputs = _inner_loop(law, nav, command, active)
+        for observer in observers:
+            observer.ticked(time_s, state, nav, command, inputs, active)
+        for step in range(clock.steps_per_tick):
+            before = state.copy()
+            advance(state, inputs, constants, clock.step_s, 1, active)
+            lost = active & ~(np.abs(state[..., POSITION]) < LOST_M).all((-1, -2))
+            lost |= active & ~np.isfinite(state).all((-1, -2))
+            if lost.any():
+                failed |= lost
+                active = active & ~lost
+                duration[lost] = time_s
+                # Out of the arithmetic for good: a lost run stands where it started, masked.
+                state[lost] = scenario.initial_state[lost]
+                before[lost] = state[lost]
+            moment = time_s + (step + 1) * clock.step_s
+            for observer in observers:
+                observer.moved(moment, before, state, active)
+        now = time_s + clock.period_s
+        passed = (frame.along_track(state[..., POSITION]) >= mission.length_m).all(-1) & active
+        if passed.any():
+            finish_time[passed] = now
+            duration[passed] = now
+            active = active & ~passed
+        if not active.any():
+            break
+    duration[active] = clock.ticks * clock.period_s
+    return Flight(np.isfinite(finish_time), failed, holding, finish_time, duration)
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """Whole-number ratios between the loops (the problem's validation makes them whole)."""
+
+    step_s: float
+    period_s: float
+    steps_per_tick: int
+    ticks_per_plan: int
+    ticks_per_fix: int
+    ticks: int
+
+    @classmethod
+    def of_problem(cls, problem: Problem, fix_period_s: float) -> _Clock:
+        simulation = problem.simulation
+        period = 1.0 / simulation.controller_rate_hz
+        return cls(
+            step_s=simulation.step_s,
+            period_s=period,
+            steps_per_tick=round(period / simulation.step_s),
+            ticks_per_plan=round(simulation.controller_rate_hz / problem.planner.rate_hz),
+            ticks_per_fix=round(fix_period_s / period),
+            ticks=max(1, math.ceil(simulation.time_limit_s / period - 1e-9)),
+        )
+
+
+def _with_velocity(covariance: Array) -> Array:
+    """Covariance of position and velocity (run, uav, 6, 6); an unfiltered velocity counts as free of error."""
+    out = np.zeros((*covariance.shape[:-2], 6, 6))
+    out[..., :3, :3] = covariance
+    return out
+
+
+def _solution(time_s: float, state: Array, fix: Fix, covariance: Array) -> NavSolution:
+    """Unfiltered solution: current place plus the held error; the error-free channels are copies."""
+    return NavSolution(
+        time_s=time_s,
+        available=fix.available,
+        position=state[..., POSITION] + fix.error,
+        velocity=state[..., VELOCITY].copy(),
+        attitude=state[..., ATTITUDE].copy(),
+        body_rates=state[..., RATES].copy(),
+        covariance=covariance,
+        common_factor=fix.common_factor,
+    )
+
+
+def _inner_loop(law: TrackingLaw, nav: NavSolution, command: Command, active: Mask) -> Array:
+    return law.inputs(
+        nav.position,
+        nav.velocity,
+        nav.attitude,
+        nav.body_rates,
+        command.position,
+        command.velocity,
+        command.direction,
+        command.yaw,
+        command.feedforward,
+        active,
+    )

@@ -1,0 +1,199 @@
+"""CityJSON block models (LoD1) as vertical prisms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from napf_mpc.errors import DataError
+from napf_mpc.world.buildings import (
+    Array,
+    Block,
+    Buildings,
+    cut_into_prisms,
+    point_array,
+    polygons_of,
+    read_json,
+    shown,
+)
+
+_BUILDINGS = ("Building", "BuildingPart")
+_GEOGRAPHIC = ("4326", "4979", "CRS84")
+# How many lists lie around a surface (a list of rings) in a geometry's boundaries.
+_SURFACE_DEPTH = {
+    "MultiSurface": 1,
+    "CompositeSurface": 1,
+    "Solid": 2,
+    "MultiSolid": 3,
+    "CompositeSolid": 3,
+}
+
+
+def read_cityjson(
+    path: Path,
+    *,
+    origin_m: tuple[float, float, float] | None = None,
+    min_height_m: float = 0.0,
+    radius_m: float = math.inf,
+) -> Buildings:
+    """Read the buildings of a CityJSON file (1.0 to 2.0) as blocks.
+
+    Only objects of type Building and BuildingPart are read. The file's coordinates are **assumed to be
+    projected and metric**, as in EPSG:7415; geographic ones are refused. Of an object's geometries the one of
+    LoD1 is taken if there is one, else the lowest above LoD0. Its footprint is the union of its faces seen
+    from above, its base the lowest and its top the highest of its vertices, so that the block holds the
+    building whatever its roof is.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    origin_m : (x, y, z), optional
+        Origin of the local frame in the file's coordinates; by default the middle of all buildings of the
+        file and the lowest base of any.
+    min_height_m : float
+        Buildings whose top lies less than this above their base are left out [m].
+    radius_m : float
+        Footprints that lie altogether farther than this from the origin are left out [m].
+
+    Returns
+    -------
+    Buildings
+        Prisms in metres about the origin, heights too.
+
+    Raises
+    ------
+    DataError
+        If the file, an object or a vertex is not usable, or no building is left.
+    """
+    document = read_json(path)
+    if not isinstance(document, dict) or document.get("type") != "CityJSON":
+        raise DataError(f'{path}: not a CityJSON file ("type" must be "CityJSON")')
+    _check_metric(path, document)
+    vertices = _cityjson_vertices(path, document)
+    objects = document.get("CityObjects")
+    if not isinstance(objects, dict):
+        raise DataError(f'{path}: "CityObjects" must be an object')
+    solids = []
+    for key, item in objects.items():
+        name = f"building {shown(key)}"
+        where = f"{path}: {name}"
+        if not isinstance(item, dict) or not isinstance(item.get("type"), str):
+            raise DataError(f'{path}: object {shown(key)} has no "type"')
+        if item["type"] in _BUILDINGS and not _stands_for_parts(item):
+            surfaces = _building_surfaces(where, item)
+            indices = np.unique(np.concatenate([ring for surface in surfaces for ring in surface]))
+            if indices[-1] >= len(vertices):
+                raise DataError(f"{where}: a boundary names vertex {indices[-1]} of {len(vertices)}")
+            solids.append((name, surfaces, vertices[indices]))
+    if not solids:
+        raise DataError(f"{path}: holds no object of type Building or BuildingPart with a geometry")
+    if origin_m is None:
+        lower = np.min([corners.min(axis=0) for _, _, corners in solids], axis=0)
+        upper = np.max([corners.max(axis=0) for _, _, corners in solids], axis=0)
+        x, y, _ = (0.5 * (lower + upper)).tolist()
+        origin_m = (x, y, float(lower[2]))
+    local = vertices - np.array(origin_m)
+    blocks = []
+    for name, surfaces, corners in solids:
+        base, top = float(corners[:, 2].min()) - origin_m[2], float(corners[:, 2].max()) - origin_m[2]
+        if not base < top:
+            raise DataError(f"{path}: {name} has no height: all its vertices lie at {base + origin_m[2]:g} m")
+        footprint = _seen_from_above(local[:, :2], surfaces)
+        if footprint.area <= 0.0:
+            raise DataError(f"{path}: {name} has no floor and no roof: its faces enclose nothing from above")
+        blocks.append(Block(name, footprint, base, top))
+    return cut_into_prisms(path, blocks, origin_m, min_height_m, radius_m)
+
+
+def _check_metric(path: Path, document: dict[str, Any]) -> None:
+    metadata = document.get("metadata", {})
+    system = metadata.get("referenceSystem") if isinstance(metadata, dict) else None
+    if isinstance(system, str) and system.replace(":", "/").split("/")[-1] in _GEOGRAPHIC:
+        raise DataError(f"{path}: referenceSystem {shown(system)} is geographic; coordinates must be metric")
+
+
+def _cityjson_vertices(path: Path, document: dict[str, Any]) -> Array:
+    vertices = point_array(f'{path}: "vertices"', document.get("vertices"), (3,))
+    if "transform" in document:
+        transform = document["transform"]
+        if not isinstance(transform, dict):
+            raise DataError(f'{path}: "transform" must be an object')
+        scale = point_array(f'{path}: "transform.scale"', [transform.get("scale")], (3,))
+        translate = point_array(f'{path}: "transform.translate"', [transform.get("translate")], (3,))
+        if (scale <= 0.0).any():
+            raise DataError(f'{path}: "transform.scale" = {scale[0].tolist()}, must be > 0')
+        with np.errstate(over="ignore"):
+            vertices = vertices * scale + translate
+    if (np.abs(vertices) > 1e9).any():
+        raise DataError(f"{path}: a vertex lies more than 1e9 m from zero; coordinates must be metric")
+    return vertices
+
+
+def _stands_for_parts(item: dict[str, Any]) -> bool:
+    """Whether a building has no geometry of its own because its parts have it."""
+    return not item.get("geometry") and bool(item.get("children"))
+
+
+def _building_surfaces(where: str, item: dict[str, Any]) -> list[list[NDArray[np.int64]]]:
+    """Faces of a building's block model, each a list of rings of vertex indices."""
+    geometries = item.get("geometry")
+    if not isinstance(geometries, list) or not all(isinstance(each, dict) for each in geometries):
+        raise DataError(f'{where}: "geometry" must be a list of objects')
+    by_lod = [(_lod(where, geometry), geometry) for geometry in geometries]
+    solid = [(lod, geometry) for lod, geometry in by_lod if lod >= 1.0]
+    if not solid:
+        raise DataError(f"{where}: has no geometry of LoD1 or more, so no height")
+    geometry = min(solid, key=lambda each: each[0])[1]
+    depth = _SURFACE_DEPTH.get(geometry["type"]) if isinstance(geometry.get("type"), str) else None
+    if depth is None:
+        raise DataError(
+            f"{where}: geometry is {shown(geometry.get('type'))}, must be one of {', '.join(_SURFACE_DEPTH)}"
+        )
+    surfaces = list(_unnest(where, geometry.get("boundaries"), depth))
+    if not surfaces:
+        raise DataError(f"{where}: its boundaries are empty")
+    faces = [[_ring_indices(where, ring) for ring in _unnest(where, each, 1)] for each in surfaces]
+    if not all(faces):
+        raise DataError(f"{where}: a face of its boundaries has no ring")
+    return faces
+
+
+def _lod(where: str, geometry: dict[str, Any]) -> float:
+    try:
+        lod = float(str(geometry.get("lod")))
+    except ValueError:
+        lod = math.nan
+    if not 0.0 <= lod < 10.0:
+        raise DataError(f"{where}: lod = {shown(geometry.get('lod'))}, must be a number such as 1 or 1.2")
+    return lod
+
+
+def _unnest(where: str, boundaries: Any, depth: int) -> Iterator[Any]:
+    if not isinstance(boundaries, list):
+        raise DataError(f"{where}: its boundaries are not nested as its type asks")
+    if depth == 1:
+        yield from boundaries
+    else:
+        for each in boundaries:
+            yield from _unnest(where, each, depth - 1)
+
+
+def _ring_indices(where: str, ring: Any) -> NDArray[np.int64]:
+    if not isinstance(ring, list) or len(ring) < 3 or not all(type(i) is int for i in ring):
+        raise DataError(f"{where}: a ring of its boundaries must be a list of at least 3 vertex indices")
+    if not all(0 <= i < 2**31 for i in ring):
+        raise DataError(f"{where}: a boundary names a vertex below zero or beyond any file")
+    return np.array(ring, dtype=np.int64)
+
+
+def _seen_from_above(plane: Array, faces: list[list[NDArray[np.int64]]]) -> shapely.Geometry:
+    """Union of the faces projected onto the ground; walls have no area there and vanish."""
+    shadows = [shapely.Polygon(plane[rings[0]], [plane[ring] for ring in rings[1:]]) for rings in faces]
+    return shapely.union_all([part for shadow in shadows for part in polygons_of(shapely.make_valid(shadow))])
