@@ -1,1 +1,79 @@
-"""UAV formation flight among obstacles with uncertain navigation."""
+"""UAV formation flight among obstacles with uncertain navigation: planners, closed loop, honest risk.
+
+Importing this package loads nothing heavy; each public name loads its module when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from napf_mpc.campaign import Missions, compare, run_campaign, simulate
+    from napf_mpc.errors import DataError, NapfError, OutputError, ProblemError, SceneError
+    from napf_mpc.navigation.solution import NavSolution
+    from napf_mpc.planners.planner import Command, Planner
+    from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner
+    from napf_mpc.problem import Problem
+    from napf_mpc.problem_file import load_problem
+    from napf_mpc.safety_distance import clearance_margin
+    from napf_mpc.vehicle.lqr import lqr
+    from napf_mpc.vehicle.quadrotor import linearize
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "ApfPlanner": "planners.potential_field",
+    "Command": "planners.planner",
+    "DataError": "errors",
+    "Missions": "campaign",
+    "NapfError": "errors",
+    "NapfPlanner": "planners.potential_field",
+    "NavSolution": "navigation.solution",
+    "OutputError": "errors",
+    "Planner": "planners.planner",
+    "Problem": "problem",
+    "ProblemError": "errors",
+    "SceneError": "errors",
+    "clearance_margin": "safety_distance",
+    "compare": "campaign",
+    "linearize": "vehicle.quadrotor",
+    "load_problem": "problem_file",
+    "lqr": "vehicle.lqr",
+    "run_campaign": "campaign",
+    "simulate": "campaign",
+}
+
+__all__ = [
+    "ApfPlanner",
+    "Command",
+    "DataError",
+    "Missions",
+    "NapfError",
+    "NapfPlanner",
+    "NavSolution",
+    "OutputError",
+    "Planner",
+    "Problem",
+    "ProblemError",
+    "SceneError",
+    "clearance_margin",
+    "compare",
+    "linearize",
+    "load_problem",
+    "lqr",
+    "run_campaign",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        value = getattr(import_module(f"napf_mpc.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'napf_mpc' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

@@ -114,7 +114,7 @@ def heading_and_climb(velocity: Array) -> tuple[Array, Array]:
 
 
 def limit_turn(velocity: Array, path_direction: Array, left: Array, max_turn_rad: float) -> Array:
-    """Unit direction of a velocity, turned from the path's direction by a largest angle (Eq. 39, as read, in 3-D).
+    """Direction of a velocity, turned from the path's by a largest angle (Eq. 39, as read, in 3-D).
 
     The direction stays in the plane of path and velocity. A velocity of zero gives the path's direction;
     one straight against the path has no such plane and is turned towards ``left``.
@@ -140,7 +140,7 @@ def limit_turn(velocity: Array, path_direction: Array, left: Array, max_turn_rad
     straight_back = (across <= 1e-12 * speed) & (forward < 0.0)
     side = np.where(straight_back[..., None], left, sideways / np.where(across > 0.0, across, 1.0)[..., None])
     angle = np.minimum(np.arctan2(np.where(straight_back, 0.0, across), forward), max_turn_rad)
-    return np.cos(angle)[..., None] * path_direction + np.sin(angle)[..., None] * side
+    return np.asarray(np.cos(angle)[..., None] * path_direction + np.sin(angle)[..., None] * side)
 
 
 def _dot(vectors: Array, axis: Array) -> Array:

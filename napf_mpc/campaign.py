@@ -21,11 +21,13 @@ from threadpoolctl import threadpool_limits
 from napf_mpc import store
 from napf_mpc.errors import OutputError, ProblemError
 from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
+from napf_mpc.planners.planner import Planner
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.record import TrajectoryRecorder
 from napf_mpc.risk import clustered_rate, paired_tests, quantiles, wilson
-from napf_mpc.simulate import Scenario, build_scenario, closed_loop
+from napf_mpc.scenario_file import write_scenario
+from napf_mpc.simulate import Scenario, build_scenario, closed_loop, initial_state
 
 Columns = store.Columns
 
@@ -45,6 +47,74 @@ class Block:
     """Wall time of each planner's flight of the block."""
     trajectories: Columns
     """Rows of the trajectories, empty if not asked for."""
+
+
+@dataclass(frozen=True)
+class Missions:
+    """Missions flown in this process."""
+
+    score: Score
+    """Verdicts and metrics on the truth."""
+    scenario: Scenario
+    """What they flew through."""
+    trajectories: Columns
+    """Rows of the trajectories, empty if not asked for."""
+
+
+def simulate(
+    problem: Problem,
+    planner: str | Planner = "napf",
+    *,
+    seed: int = 0,
+    runs: int | range = 1,
+    record_every: int = 0,
+    data_folder: Path | None = None,
+) -> Missions:
+    """Fly missions in this process and judge them on the truth.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation problem, see :func:`napf_mpc.load_problem`.
+    planner : str or Planner
+        Name, or a planner of your own.
+    seed : int
+        Campaign seed.
+    runs : int or range
+        Number of runs, or their indices in the campaign of this seed.
+    record_every : int
+        Keep every n-th tick of the inner loop as trajectory; 0 for none.
+    data_folder : Path, optional
+        Where data files lie.
+
+    Returns
+    -------
+    Missions
+        Score, scenario and trajectories.
+
+    Raises
+    ------
+    NapfError
+        If a setting or the problem is not usable, or data are missing.
+    """
+    indices = range(runs) if isinstance(runs, int) else runs
+    pilot = make_planner(planner, problem) if isinstance(planner, str) else planner
+    check_campaign([pilot.name], indices.stop, seed, 1)
+    scenario = build_scenario(problem, seed, indices, data_folder)
+    score, trajectories = fly(problem, pilot, scenario, record_every)
+    return Missions(score, scenario, trajectories)
+
+
+def fly(
+    problem: Problem, planner: Planner, scenario: Scenario, record_every: int = 0
+) -> tuple[Score, Columns]:
+    """Fly one planner through a scenario; return its score and its trajectories (empty if not asked for)."""
+    judge = MissionScore(problem, scenario)
+    if not record_every:
+        return judge.score(closed_loop(problem, planner, scenario, (judge,))), {}
+    recorder = TrajectoryRecorder(planner.name, scenario.runs, record_every)
+    flight = closed_loop(problem, planner, scenario, (judge, recorder))
+    return judge.score(flight), recorder.columns()
 
 
 def fly_block(
@@ -77,29 +147,53 @@ def fly_block(
     Block
         Rows ordered by planner, then run.
     """
+    # More threads than one would make workers fight for the cores, and win nothing on small matrices.
     with threadpool_limits(1):
         scenario = build_scenario(problem, seed, runs, data_folder)
         rows, timing, trajectories = [], [], []
         for name in planners:
             began = time.perf_counter()
-            score, recorder = fly(problem, name, scenario, record_every)
-            elapsed = time.perf_counter() - began
+            score, track = fly(problem, make_planner(name, problem), scenario, record_every)
+            timing.append(_timing_row(name, runs, time.perf_counter() - began))
             rows.append(score_rows(name, seed, score))
-            timing.append(_timing_row(name, runs, elapsed))
-            if recorder is not None:
-                trajectories.append(recorder.columns())
+            if track:
+                trajectories.append(track)
     return Block(store.stack(rows), store.stack(timing), store.stack(trajectories) if trajectories else {})
 
 
-def fly(
-    problem: Problem, planner: str, scenario: Scenario, record_every: int = 0
-) -> tuple[Score, TrajectoryRecorder | None]:
-    """Fly one planner through a scenario and judge it."""
-    judge = MissionScore(problem, scenario)
-    recorder = TrajectoryRecorder(planner, scenario.runs, record_every) if record_every else None
-    observers = (judge,) if recorder is None else (judge, recorder)
-    flight = closed_loop(problem, make_planner(planner, problem), scenario, observers)
-    return judge.score(flight), recorder
+def compare(
+    problem: Problem,
+    planners: Sequence[str] = ("apf", "napf"),
+    *,
+    runs: int = 30,
+    seed: int = 0,
+    data_folder: Path | None = None,
+) -> dict[str, Any]:
+    """Fly planners on the same seeds in this process and summarise (the paper's Table 1 for any problem).
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation problem.
+    planners : sequence of str
+        Names of planners.
+    runs, seed : int
+        Number of runs and campaign seed.
+    data_folder : Path, optional
+        Where data files lie.
+
+    Returns
+    -------
+    dict
+        Summary with rates, intervals and paired tests; the layout of ``summary.json``.
+    """
+    check_campaign(planners, runs, seed, 1)
+    blocks = _chunks(list(range(runs)), _block_runs(problem, runs, 1))
+    rows = store.stack([fly_block(problem, planners, seed, block, data_folder).rows for block in blocks])
+    identity = {
+        "problem": problem.title, "problem_hash": problem.digest(), "seed": seed, "planners": list(planners)
+    }  # fmt: skip
+    return summarise(_ordered(rows, list(planners), runs), identity)
 
 
 def _timing_row(planner: str, runs: range, seconds: float) -> Columns:
@@ -158,6 +252,21 @@ def check_campaign(planners: Sequence[str], runs: int, seed: int, workers: int) 
         raise ProblemError("campaign", faults)
 
 
+def check_flyable(
+    problem: Problem, planners: Sequence[str], seed: int = 0, data_folder: Path | None = None
+) -> None:
+    """Build everything that a flight needs, so that what cannot fly fails here, once, and not in a worker.
+
+    Raises
+    ------
+    NapfError
+        If a planner is not built, the scene cannot be built, data are missing, or the inner loop is unstable.
+    """
+    for planner in planners:
+        make_planner(planner, problem)
+    build_scenario(problem, seed, range(1), data_folder)
+
+
 def run_campaign(
     problem: Problem,
     planners: Sequence[str],
@@ -211,9 +320,7 @@ def run_campaign(
         If the folder holds another campaign, or cannot be written.
     """
     check_campaign(planners, runs, seed, workers)
-    for planner in planners:
-        make_planner(planner, problem)
-    build_scenario(problem, seed, range(1), data_folder)  # fails here, once, rather than in a worker
+    check_flyable(problem, planners, seed, data_folder)
     store.output_folder(out)
     identity = {
         "problem": name,
@@ -232,7 +339,16 @@ def run_campaign(
         _write_block(out, block_range, block)
         done |= set(block_range)
         progress(len(done))
-    return conclude(out, identity, runs)
+    summary = conclude(out, identity, runs)
+    write_scenario(
+        out / "scenario.json",
+        problem.model_dump(mode="json"),
+        seed,
+        range(runs),
+        initial_state(problem),
+        lambda block: build_scenario(problem, seed, block, data_folder).obstacles,
+    )
+    return summary
 
 
 def _block_runs(problem: Problem, runs: int, workers: int) -> int:
@@ -355,7 +471,7 @@ def _ordered(table: Columns, planners: Sequence[str], runs: int) -> Columns:
 
 
 def summarise(rows: Columns, identity: dict[str, Any]) -> dict[str, Any]:
-    """Summary of a table of runs: per planner the counts, rates with intervals and quantiles; then paired tests."""
+    """Per planner the counts, rates with intervals and quantiles of a table of runs; then paired tests."""
     planners: list[str] = identity["planners"]
     parts = {name: {k: v[rows["planner"] == name] for k, v in rows.items()} for name in planners}
     hits: dict[str, NDArray[np.bool_]] = {

@@ -63,8 +63,9 @@ def find_data_file(name: str, data_folder: Path | None) -> Path:
         found = path.is_file()
         is_folder = path.is_dir()
     except (OSError, ValueError, RuntimeError) as error:  # too long a name, a loop of links
+        reason = getattr(error, "strerror", None) or shown_text(str(error), 120)
         raise DataError(
-            f'data file "{shown_text(name, 120)}" cannot be looked up in {folder}: {error}'
+            f'data file "{shown_text(name, 120)}" cannot be looked up in {folder}: {reason}'
         ) from error
     if found:
         return path

@@ -101,7 +101,7 @@ class MissionScore:
         self._last_obstacle = self._last_obstacle_along()
 
     def _last_obstacle_along(self) -> Array:
-        """Along-track coordinate (run,) where the last obstacle in the formation's corridor ends; NaN if none."""
+        """Along-track place (run,) where the last obstacle in the formation's corridor ends; NaN if none."""
         half_width = float(np.abs(self._offsets[:, 1]).max()) + self._problem.planner.influence_m
         length = formation_mission(self._problem).length_m
         out = np.full(len(self._scenario.runs), np.nan)

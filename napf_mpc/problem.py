@@ -677,8 +677,7 @@ class Problem(_Section):
                 return self.formation.count
 
     def digest(self) -> str:
-        """SHA-256 of everything that decides a result; words (title, description, source,
-        reference) do not count."""
+        """SHA-256 of everything that decides a result; words and the reference do not count."""
         words = {"title", "description", "source", "reference"}
         return hashlib.sha256(self.model_dump_json(exclude=words).encode()).hexdigest()
 

@@ -86,6 +86,8 @@ class _Place:
 
     def field(self, name: str) -> _Place | None:
         """Give the place of one key of a table."""
+        if get_origin(self.annotation) is dict:
+            return _Place.of(get_args(self.annotation)[1])
         info = self.model.model_fields.get(name) if self.model else None
         if info is None:
             return None
@@ -123,6 +125,10 @@ def describe_faults(error: ValidationError) -> list[str]:
 def _lines(details: ErrorDetails) -> Iterator[str]:
     kind, value = details["type"], details["input"]
     path, places = _walk(details["loc"])
+    if path and path[-1] == "[key]":  # pydantic's mark for the name of a free table's key
+        names = get_args(_Place.of(get_args(places[-3].annotation)[0]).annotation) if places[-3] else ()
+        yield f"{shown_key_path(path[:-1])}: unknown key; must be {_choice(names)}{did_you_mean(str(value), names)}"
+        return
     place = places[-1]
     key = shown_key_path(path)
     if kind == "value_error":
@@ -267,6 +273,9 @@ def _noun(place: _Place | None) -> str:
         return _choice(get_args(annotation))
     if get_origin(annotation) is tuple:
         return _list_noun(place)
+    if get_origin(annotation) is dict:
+        keys, entry = (_Place.of(arg) for arg in get_args(annotation))
+        return f"a table with keys out of {_noun(keys)}, each {_noun(entry)}"
     if kinds := place.kinds():
         return f"a table with {place.tag} = {_choice(kinds)}"
     if place.model is not None:

@@ -7,6 +7,7 @@ Input is data from anybody: whatever a file holds, the answer is a valid problem
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,10 @@ __all__ = ["load_problem", "problem_schema"]
 
 MAX_BYTES = 10_000_000
 MAX_DEPTH = 20
+MAX_KEY_PARTS = 50
+MAX_BITS = (
+    300  # far beyond every limit; pydantic writes integers out in decimal, where Python refuses long ones
+)
 # A section without a kind is of this kind; the model itself tells kinds apart by the key alone.
 _DEFAULT_KINDS = {"mission": "formation", "navigation": "gauss_markov"}
 
@@ -116,6 +121,7 @@ def _read(path: Path, source: str) -> str:
 
 
 def _parse(text: str, source: str) -> dict[str, Any]:
+    _refuse_long_keys(text, source)
     try:
         data = tomllib.loads(text)
     except RecursionError as error:
@@ -124,6 +130,16 @@ def _parse(text: str, source: str) -> dict[str, Any]:
         raise ProblemError(source, [f"is not TOML: {shown_text(str(error), 200)}"]) from error
     _refuse_deep(data, source)
     return data
+
+
+def _refuse_long_keys(text: str, source: str) -> None:
+    """Refuse dotted keys that would take hours: tomllib's time grows with the square of their parts."""
+    unquoted = re.sub(r""""(?:[^"\\\n]|\\.)*"|'[^'\n]*'""", "q", text)  # quoted parts may hold anything
+    for piece in re.split(r"[=,{\n]", unquoted):
+        if piece.count(".") > MAX_KEY_PARTS:
+            parts = len(re.findall(r"\.(?![.\s])", piece))  # rows of dots in a text are no key
+            if parts > MAX_KEY_PARTS:
+                raise ProblemError(source, [f"has a key of more than {MAX_KEY_PARTS} parts; no problem has"])
 
 
 def _refuse_deep(data: dict[str, Any], source: str) -> None:
@@ -143,9 +159,11 @@ def _validate(data: dict[str, Any], source: str) -> Problem:
 
 
 def _tuples(value: Any) -> Any:
-    """Lists as tuples: the strict model takes nothing else."""
+    """Lists as tuples, all that the strict model takes; integers cut to a size that can be printed."""
     if isinstance(value, dict):
         return {key: _tuples(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
         return tuple(_tuples(entry) for entry in value)
+    if isinstance(value, int) and value.bit_length() > MAX_BITS:
+        return 2**MAX_BITS if value > 0 else -(2**MAX_BITS)
     return value

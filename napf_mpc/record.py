@@ -76,7 +76,7 @@ class TrajectoryRecorder:
         self._parts.append(rows)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """All rows so far, ordered by run, then time, then UAV; ``slack_m`` is null for planners without a QP."""
+        """All rows so far by run, time and UAV; ``slack_m`` is null for planners without a QP."""
         if not self._parts:
             return {}
         table = {name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]}

@@ -70,8 +70,8 @@ def axis_sigma(covariance: Array, reading: Literal["largest", "rms"]) -> Array:
     """Standard deviation without a direction, (...) [m]: the largest axis' or the axes' root mean square."""
     variances = np.stack([covariance[..., 0, 0], covariance[..., 1, 1], covariance[..., 2, 2]], axis=-1)
     if reading == "largest":
-        return np.sqrt(variances.max(-1))
-    return np.sqrt((variances[..., 0] + variances[..., 1] + variances[..., 2]) / 3.0)
+        return np.asarray(np.sqrt(variances.max(-1)))
+    return np.asarray(np.sqrt((variances[..., 0] + variances[..., 1] + variances[..., 2]) / 3.0))
 
 
 def clearance_margin(covariance: Array, normal: Array, confidence: float) -> Array:

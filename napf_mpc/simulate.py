@@ -241,7 +241,7 @@ class _Clock:
 
 
 def _with_velocity(covariance: Array) -> Array:
-    """Covariance of position and velocity (run, uav, 6, 6); an unfiltered velocity counts as free of error."""
+    """Covariance of position and velocity (run, uav, 6, 6); an unfiltered velocity has no error."""
     out = np.zeros((*covariance.shape[:-2], 6, 6))
     out[..., :3, :3] = covariance
     return out

@@ -44,7 +44,7 @@ def _replaced(path: Path) -> Iterator[IO[bytes]]:
             os.unlink(name)
 
 
-def write_bytes(path: Path, content: Callable[[IO[bytes]], None]) -> None:
+def write_bytes(path: Path, content: Callable[[IO[bytes]], object]) -> None:
     """Write a file through a callback, whole or not at all.
 
     Raises
@@ -56,11 +56,16 @@ def write_bytes(path: Path, content: Callable[[IO[bytes]], None]) -> None:
         content(file)
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: Any, indent: int | None = 2) -> None:
     """Write JSON (no NaN: undefined values are null), whole or not at all."""
-    text = json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    text = json.dumps(value, indent=indent, allow_nan=False, ensure_ascii=False) + "\n"
     with _replaced(path) as file:
         file.write(text.encode())
+
+
+def to_json(value: Any) -> str:
+    """JSON text of plain data; numbers that are not finite are refused."""
+    return json.dumps(value, allow_nan=False)
 
 
 def read_json(path: Path) -> Any:

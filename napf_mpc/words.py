@@ -41,7 +41,7 @@ def _pieces(value: Any, length: int) -> Iterator[str]:
         yield f'"{shown_text(value, length - 2)}"'
     elif isinstance(value, int):
         # Python refuses to write out numbers of thousands of digits.
-        yield str(value) if value.bit_length() <= 200 else f"an integer of {value.bit_length()} bits"
+        yield str(value) if value.bit_length() <= 200 else "an integer of more than 60 digits"
     elif isinstance(value, dict):
         yield "{"
         for i, (key, entry) in enumerate(value.items()):

@@ -74,7 +74,7 @@ class ErrorLog:
         steps = np.diff(self.time_s)
         if not (np.abs(self.time_s) <= _MAX_TIME_S).all() or not (steps >= _MIN_STEP_S).all():
             raise DataError(
-                f"{self.source}: times must ascend by {_MIN_STEP_S:g} s or more and stay within {_MAX_TIME_S:g} s"
+                f"{self.source}: times must ascend by {_MIN_STEP_S:g} s or more, within +-{_MAX_TIME_S:g} s"
             )
         used = self.available
         for values, limit, what in (

@@ -111,8 +111,11 @@ class RecordedErrors:
     """Replayed errors: e_i = sqrt(c) e_log(common place) + sqrt(1 - c) e_log(own place).
 
     The reported covariance is mixed alike, Sigma_i = c Sigma_common + (1 - c) Sigma_own, and two UAVs share
-    Sigma_ij = c Sigma_common, c the common-mode share. The sum of two independent errors is nearer to a
-    normal law than each: for 0 < c < 1 the mixing thins the log's tails.
+    Sigma_ij = c Sigma_common, c the common-mode share. For 0 < c < 1 this is no longer the measured law. The
+    mixing thins the log's tails, a sum of two errors being nearer to a normal law than each: on the Nagoya
+    log, over all pairs of its epochs, the kurtosis of east error over reported sigma falls from 8.8 to 5.2 at
+    c = 0.5, while the share beyond 3 sigma stays (3.6 % and 3.9 %). A mean error in the log grows by the
+    factor sqrt(c) + sqrt(1 - c). For the measured law itself use c = 0 or c = 1.
 
     A sample of the log is held until the next. Without a fix in either part a UAV has none: for 0 < c < 1
     outages are more frequent than in the log. A UAV that starts in an outage carries the last fix before it

@@ -49,7 +49,7 @@ class NavSolution:
         """
         cross = np.einsum("rak,rbk->rab", self.common_factor[:, i], self.common_factor[:, j])
         sigma = self.position_covariance
-        return sigma[:, i] + sigma[:, j] - cross - cross.transpose(0, 2, 1)
+        return np.asarray(sigma[:, i] + sigma[:, j] - cross - cross.transpose(0, 2, 1))
 
     def trusted(self) -> NDArray[np.bool_]:
         """(run, uav): a fix is there, all numbers are finite, and every position variance is positive.
@@ -61,4 +61,4 @@ class NavSolution:
         finite &= np.isfinite(self.attitude).all(-1) & np.isfinite(self.body_rates).all(-1)
         finite &= np.isfinite(self.covariance).all((-1, -2))
         variances = np.einsum("...ii->...i", self.position_covariance)
-        return self.available & finite & (variances > 0.0).all(-1)
+        return np.asarray(self.available & finite & (variances > 0.0).all(-1))

@@ -110,7 +110,7 @@ class PotentialFieldPlanner:
         force = apf.repulsive_force(
             rho, near.gradient, settings.repulsive_gain, influence, settings.min_distance_m
         )
-        return force, (rho < influence).any(-1)
+        return force, np.asarray((rho < influence).any(-1))
 
     def _hold(self, command: Command, nav: NavSolution, trusted: NDArray[np.bool_]) -> Command:
         """Hold the last known place where navigation is not to be trusted: never "no obstacle"."""

@@ -76,9 +76,9 @@ def place_apart(uniforms: Callable[[int], Array], rules: ApartRules) -> Array:
     count = rules.count
     x_low, x_high, y_low, y_high = rules.plane_box()
     reach = 2.0 * rules.radius_m[1] + rules.min_gap_m
-    finest = math.ceil(math.sqrt(count)) if count else 1
-    cells_x = max(1, min(int((x_high - x_low) / reach), finest))
-    cells_y = max(1, min(int((y_high - y_low) / reach), finest))
+    # Cells at least as wide as the reach of two obstacles, and no more of them than obstacles.
+    cells_x = max(1, min(int((x_high - x_low) / reach), count))
+    cells_y = max(1, min(int((y_high - y_low) / reach), count // cells_x))
     first = np.full((cells_x, cells_y), -1, dtype=np.int64)
     following = np.full(count, -1, dtype=np.int64)
     ranges = np.array([rules.along_m, rules.lateral_m, rules.height_m, rules.radius_m])

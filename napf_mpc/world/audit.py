@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 
 BEYOND_M = 10.0
-"""How far endless solids are continued beyond the points asked about [m]; the nearest point is level with them."""
+"""Length of an endless solid beyond the points asked about [m]; its nearest surface is level with them."""
 
 
 def audit_clearance(shapes: Sequence[Shape], points: ArrayLike, radius_m: float) -> NDArray[np.float64]:
@@ -75,7 +75,7 @@ def audit_clearance(shapes: Sequence[Shape], points: ArrayLike, radius_m: float)
 
 
 def _fcl_object(shape: Shape, low: float, high: float) -> fcl.CollisionObject:
-    """Object for the broad phase; endless ends are cut at heights `low` and `high`, or just past the other end."""
+    """Object for the broad phase; endless ends are cut at `low` and `high`, or past the other end."""
     if isinstance(shape, Sphere):
         return fcl.CollisionObject(fcl.Sphere(shape.radius_m), fcl.Transform(np.array(shape.centre_m)))
     if isinstance(shape, Box):

@@ -225,7 +225,7 @@ def _clean_ring(name: str, ring: ArrayLike) -> NDArray[np.float64]:
         raise ValueError(f"{name} has shape {array.shape}, must be (vertex, 2)")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} has a vertex that is not finite")
-    step = array - np.roll(array, 1, axis=0)
+    step = array - np.roll(array, -1, axis=0)
     array = array[np.hypot(step[:, 0], step[:, 1]) > TOUCH_M]
     if len(array) < 3:
         raise ValueError(f"{name} has {len(array)} distinct vertices, must have at least 3")

@@ -85,7 +85,21 @@ def test_the_generator_writes_the_module_that_flies(tmp_path, monkeypatch):
 def test_every_operation_of_the_generator_means_what_casadi_means():
     x, u, p = ca.SX.sym("x", 12), ca.SX.sym("u", 4), ca.SX.sym("p", 4)
     a, b = x[0], x[1]
-    terms = [a + b, a - b, a * b, a / b, -a, a**2, 2 * a, 1 / a, ca.sqrt(b), ca.sin(a), ca.cos(a), ca.tan(a), a]
+    terms = [
+        a + b,
+        a - b,
+        a * b,
+        a / b,
+        -a,
+        a**2,
+        2 * a,
+        1 / a,
+        ca.sqrt(b),
+        ca.sin(a),
+        ca.cos(a),
+        ca.tan(a),
+        a,
+    ]
     function = ca.Function("every", [x, u, p], [ca.vertcat(*terms, ca.SX(0.125))])
     namespace: dict[str, object] = {}
     exec(compile(codegen.generate(function).replace("@compiled\n", ""), "generated", "exec"), namespace)

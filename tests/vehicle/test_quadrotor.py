@@ -1,4 +1,4 @@
-"""The model against independent mechanics, its linearisation against hand-derived matrices, the mixer's signs."""
+"""The model against independent mechanics, its linearisation by hand, the mixer's signs."""
 
 import math
 
@@ -80,8 +80,13 @@ def test_without_thrust_it_falls_with_g_whatever_its_attitude():
 
 
 def test_tilt_pushes_where_a_pilot_expects():
-    """Pitch up-axis forward = +x, roll to the right = -y; at yaw 90 degrees the same tilts push to +y, +x."""
-    for tilt, yaw, expected in [(PITCH, 0.0, (1, 0)), (ROLL, 0.0, (0, -1)), (PITCH, 90.0, (0, 1)), (ROLL, 90.0, (1, 0))]:
+    """Pitch forward pushes to +x, roll to the right to -y; turned by 90 degrees, to +y and +x."""
+    for tilt, yaw, expected in [
+        (PITCH, 0.0, (1, 0)),
+        (ROLL, 0.0, (0, -1)),
+        (PITCH, 90.0, (0, 1)),
+        (ROLL, 90.0, (1, 0)),
+    ]:
         x = np.zeros(12)
         x[tilt], x[YAW] = 0.1, math.radians(yaw)
         push = rate(PAPER, x, hover_input(PAPER))[VELOCITY][:2]
@@ -185,13 +190,12 @@ def test_mixer_gives_the_moments_of_forces_at_the_rotors_places():
 
 
 @pytest.mark.parametrize(
-    ("rotor", "faster"),
-    [(1, ("pitch_torque", "+")), (3, ("pitch_torque", "-")), (4, ("roll_torque", "+")), (2, ("roll_torque", "-"))],
+    ("rotor", "name", "sign"),
+    [(1, "pitch_torque", 1), (2, "roll_torque", -1), (3, "pitch_torque", -1), (4, "roll_torque", 1)],
 )
-def test_a_faster_rotor_lifts_its_side(rotor, faster):
-    name, sign = faster
+def test_a_faster_rotor_lifts_its_side(rotor, name, sign):
     column = mixer(PAPER)[:, rotor - 1]
-    assert column[INPUT_NAMES.index(name)] * (1 if sign == "+" else -1) == pytest.approx(0.24)
+    assert column[INPUT_NAMES.index(name)] * sign == pytest.approx(0.24)
     assert column[0] == 1.0
     assert np.sign(column[3]) == (1 if rotor in (1, 3) else -1)
     # The raised side lets the thrust point to the other one: rotor 1 at -x drives towards +x.

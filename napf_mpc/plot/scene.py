@@ -1,0 +1,280 @@
+"""Obstacles, ellipses and marks as seen from above and from the side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import Normalize
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Ellipse, Patch, PathPatch
+from matplotlib.path import Path as Outline
+from numpy.typing import NDArray
+
+from napf_mpc.formation import PathFrame
+from napf_mpc.plot.style import BLACK, GREY, PALE, RULE
+from napf_mpc.world.obstacles import ObstacleSet
+from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
+
+Array = NDArray[np.float64]
+
+HEIGHT_SHADES = Normalize(0.0, 150.0)
+"""Heights over which the grey of buildings darkens [m]."""
+INFLATED_COLOUR = "#8A6D00"
+"""Dashed outline of inflated obstacles: dark, and no UAV's colour."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Part of the ground plan that a figure shows."""
+
+    x: tuple[float, float]
+    """East [m]."""
+    y: tuple[float, float]
+    """North [m]."""
+
+    def shows(self, lower: Array, upper: Array) -> NDArray[np.bool_]:
+        """Whether boxes with corners (n, 3) reach into the view, (n,)."""
+        in_x = (lower[:, 0] <= self.x[1]) & (upper[:, 0] >= self.x[0])
+        return np.asarray(in_x & (lower[:, 1] <= self.y[1]) & (upper[:, 1] >= self.y[0]))
+
+    @property
+    def width(self) -> float:
+        """East-west [m]."""
+        return self.x[1] - self.x[0]
+
+    @property
+    def height(self) -> float:
+        """North-south [m]."""
+        return self.y[1] - self.y[0]
+
+
+def view_of(points: Array, obstacles: ObstacleSet, pad_m: float, reach_m: float) -> View:
+    """View that holds points (..., 3), and the obstacles whose box lies within a reach of them.
+
+    Parameters
+    ----------
+    points : array, shape (..., 3)
+        What has to be seen [m]; points that are not finite do not count.
+    obstacles : ObstacleSet
+        One scene.
+    pad_m : float
+        Space around [m].
+    reach_m : float
+        Obstacles farther than this beside the points do not widen the view [m].
+    """
+    places = points.reshape(-1, 3)
+    places = places[np.isfinite(places).all(-1)]
+    low, high = places.min(0), places.max(0)
+    if len(obstacles):
+        lower, upper = obstacles.boxes
+        close = View((low[0], high[0]), (low[1] - reach_m, high[1] + reach_m)).shows(lower, upper)
+        if close.any() and close.sum() <= 200:
+            low = np.minimum(low, np.maximum(lower[close].min(0), low - reach_m))
+            high = np.maximum(high, np.minimum(upper[close].max(0), high + reach_m))
+    return View((low[0] - pad_m, high[0] + pad_m), (low[1] - pad_m, high[1] + pad_m))
+
+
+def plan_outline(shape: Shape) -> Patch:
+    """Outline of a shape from above, without colours."""
+    match shape:
+        case Sphere() | Cylinder():
+            return Circle(shape.centre_m[:2], shape.radius_m)
+        case Box():
+            return PathPatch(_outline([_box_corners(shape)]))
+        case Prism():
+            return PathPatch(_outline(shape.rings))
+
+
+def _box_corners(box: Box) -> Array:
+    half = 0.5 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(box.size_m[:2])
+    cos, sin = math.cos(box.heading_rad), math.sin(box.heading_rad)
+    turned = np.column_stack([cos * half[:, 0] - sin * half[:, 1], sin * half[:, 0] + cos * half[:, 1]])
+    return np.asarray(turned + np.array(box.centre_m[:2]))
+
+
+def _outline(rings: Sequence[Array]) -> Outline:
+    """Closed rings as one outline; holes run the other way round, so that filling leaves them open."""
+    vertices = np.concatenate([np.concatenate([ring, ring[:1]]) for ring in rings])
+    codes = np.full(len(vertices), Outline.LINETO, dtype=Outline.code_type)
+    stops = np.cumsum([0, *(len(ring) + 1 for ring in rings)])
+    for start, stop in pairwise(stops.tolist()):
+        codes[start], codes[stop - 1] = Outline.MOVETO, Outline.CLOSEPOLY
+    return Outline(vertices, codes)
+
+
+def draw_plan(axes: Axes, obstacles: ObstacleSet, view: View) -> bool:
+    """Draw the obstacles in view from above; buildings darken with height.
+
+    Returns
+    -------
+    bool
+        Whether greys stand for heights.
+    """
+    if len(obstacles) == 0:
+        return False
+    shown = np.flatnonzero(view.shows(*obstacles.boxes)).tolist()
+    shapes = obstacles.shapes()
+    picked = [shapes[i] for i in shown]
+    by_height = any(isinstance(shape, Prism) for shape in picked)
+    patches = [plan_outline(shape) for shape in picked]
+    collection = PatchCollection(patches, linewidths=0.4 if by_height else 0.6, edgecolors=RULE, zorder=1.0)
+    if by_height:
+        tops = np.array([shape.centre_m[2] if isinstance(shape, Sphere) else _top(shape) for shape in picked])
+        collection.set_facecolor(building_colours(tops))
+    else:
+        collection.set_facecolor(PALE)
+    axes.add_collection(collection, autolim=False)
+    return by_height
+
+
+def _top(shape: Box | Cylinder | Prism) -> float:
+    top = shape.centre_m[2] + 0.5 * shape.size_m[2] if isinstance(shape, Box) else shape.top_m
+    return min(top, HEIGHT_SHADES.vmax or 0.0)
+
+
+def building_colours(tops_m: Array) -> Array:
+    """Greys (n, 4) of buildings by the height of their roofs: the taller, the darker."""
+    return np.asarray(colormaps["Greys"](0.08 + 0.55 * np.clip(HEIGHT_SHADES(tops_m), 0.0, 1.0)))
+
+
+def draw_side(axes: Axes, obstacles: ObstacleSet, frame: PathFrame, view: View) -> None:
+    """Draw the obstacles in view from the side: along the path against height. Those without end fill the height."""
+    if len(obstacles) == 0:
+        return
+    lower, upper = obstacles.boxes
+    shapes = obstacles.shapes()
+    low_z, high_z = axes.get_ylim()
+    for i in np.flatnonzero(view.shows(lower, upper)).tolist():
+        shape = shapes[i]
+        if isinstance(shape, Sphere):
+            along = float(frame.along_track(np.array(shape.centre_m)))
+            axes.add_patch(Circle((along, shape.centre_m[2]), shape.radius_m, **_SOLID))
+            continue
+        corners = _ground_corners(shape, float(frame.origin[2]))
+        along_all = frame.along_track(corners)
+        base, top = max(float(lower[i, 2]), low_z), min(float(upper[i, 2]), high_z)
+        if top > base:
+            span = (float(along_all.min()), float(along_all.max()))
+            axes.fill_between(span, base, top, color=PALE, alpha=0.5, linewidth=0.0, zorder=1.0)
+
+
+_SOLID = {"facecolor": PALE, "edgecolor": RULE, "linewidth": 0.6, "zorder": 1.0}
+
+
+def _ground_corners(shape: Box | Cylinder | Prism, height_m: float) -> Array:
+    if isinstance(shape, Cylinder):
+        angle = np.linspace(0.0, 2.0 * math.pi, 24, endpoint=False)
+        plan = np.array(shape.centre_m) + shape.radius_m * np.column_stack([np.cos(angle), np.sin(angle)])
+    elif isinstance(shape, Box):
+        plan = _box_corners(shape)
+    else:
+        plan = np.concatenate(shape.rings)
+    return np.column_stack([plan, np.full(len(plan), height_m)])
+
+
+def draw_inflated(
+    axes: Axes, shape: Shape, margin_m: float, height_m: float, colour: str = INFLATED_COLOUR
+) -> Patch | None:
+    """Draw an obstacle inflated by a margin from above, dashed.
+
+    A sphere or cylinder becomes a circle of radius + margin. Any other shape is drawn as the line on which
+    the library's own distance at a height equals the margin.
+
+    Returns
+    -------
+    Patch or None
+        The circle, or None where a line was drawn.
+    """
+    if isinstance(shape, (Sphere, Cylinder)):
+        circle = Circle(
+            shape.centre_m[:2],
+            shape.radius_m + margin_m,
+            facecolor="none",
+            edgecolor=colour,
+            linewidth=0.7,
+            linestyle=(0, (3, 1.5)),
+            zorder=1.5,
+        )
+        axes.add_patch(circle)
+        return circle
+    alone = ObstacleSet.from_shapes([shape])
+    lower, upper = alone.boxes
+    reach = 1.05 * margin_m + 0.5
+    x = np.linspace(lower[0, 0] - reach, upper[0, 0] + reach, 121)
+    y = np.linspace(lower[0, 1] - reach, upper[0, 1] + reach, 121)
+    grid = np.stack([*np.meshgrid(x, y), np.full((121, 121), height_m)], axis=-1)
+    distance = alone.signed_distance(grid.reshape(1, -1, 3)).reshape(121, 121)
+    if distance.min() < margin_m < distance.max():
+        axes.contour(
+            x, y, distance, levels=[margin_m], colors=colour, linewidths=0.7, linestyles=[(0, (3, 1.5))], zorder=1.5
+        )
+    return None
+
+
+def draw_ellipses(
+    axes: Axes, centres: Array, sigma: Array, k: float, colour: str, alpha: float = 0.10
+) -> list[Ellipse]:
+    """Draw k-sigma ellipses of reported positions from above.
+
+    Parameters
+    ----------
+    axes : Axes
+        Ground plan.
+    centres, sigma : array, shape (n, 3)
+        Estimates and reported sigmas of the axes [m]; those that are not finite are left out.
+    k : float
+        Number of sigmas.
+    colour : str
+        Of the UAV.
+    alpha : float
+        Opacity of the filling.
+    """
+    drawn = []
+    for centre, spread in zip(centres, sigma, strict=True):
+        if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
+            continue
+        width, height = 2.0 * k * float(spread[0]), 2.0 * k * float(spread[1])
+        ellipse = Ellipse(
+            (float(centre[0]), float(centre[1])), width, height, facecolor=colour, alpha=alpha, linewidth=0.0
+        )
+        edge = Ellipse(
+            (float(centre[0]), float(centre[1])), width, height, fill=False, edgecolor=colour, linewidth=0.5
+        )
+        edge.set_alpha(0.6)
+        axes.add_patch(ellipse)
+        axes.add_patch(edge)
+        drawn.append(ellipse)
+    return drawn
+
+
+def start_mark() -> Line2D:
+    """Legend entry for the start of a path."""
+    return Line2D([], [], linestyle="", marker="o", markersize=4, mfc="white", mec=GREY, label="start")
+
+
+def end_mark() -> Line2D:
+    """Legend entry for the end of a path."""
+    return Line2D([], [], linestyle="", marker="s", markersize=4, mfc=GREY, mec=GREY, label="end")
+
+
+def contact_mark() -> Line2D:
+    """Legend entry for a contact."""
+    return Line2D([], [], linestyle="", marker="X", markersize=6, mfc=BLACK, mec="white", mew=0.5, label="contact")
+
+
+def inflated_mark(k: float) -> Line2D:
+    """Legend entry for inflated obstacles."""
+    words = f"obstacle + {k:.3g}\N{NO-BREAK SPACE}σ"
+    return Line2D([], [], color=INFLATED_COLOUR, linewidth=0.7, linestyle=(0, (3, 1.5)), label=words)
+
+
+def obstacle_mark() -> Patch:
+    """Legend entry for obstacles."""
+    return Patch(facecolor=PALE, edgecolor=RULE, linewidth=0.6, label="obstacle")

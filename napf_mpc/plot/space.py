@@ -1,0 +1,101 @@
+"""A flight seen in space."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, cast
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from napf_mpc.plot import scene
+from napf_mpc.plot.states import uav_handles
+from napf_mpc.plot.style import PAGE_IN, PALE, Page, credit_of, planner_name, uav_colour
+from napf_mpc.plot.tracks import Track
+from napf_mpc.problem import Problem
+from napf_mpc.world.obstacles import ObstacleSet
+from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
+
+Array = NDArray[np.float64]
+
+MOST_SOLIDS = 250
+"""Solids drawn at most, those nearest to the paths; more only hide each other."""
+
+
+def space_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figure:
+    """Paths and obstacles in space, true to scale; solids without end are cut at the heights shown."""
+    view = scene.view_of(flown.position, obstacles, pad_m=2.0, reach_m=12.0)
+    heights = flown.position[..., 2]
+    low, high = float(heights.min()) - 2.0, float(heights.max()) + 2.0
+    shown: list[Shape] = []
+    if len(obstacles):
+        lower, upper = obstacles.boxes
+        inside = np.flatnonzero(view.shows(lower, upper))
+        if len(inside) > MOST_SOLIDS:
+            # The distance between boxes is enough to choose what to draw.
+            points = flown.position.reshape(-1, 3)[:: max(1, flown.position.size // 3000)]
+            gap = np.maximum(np.maximum(lower[inside, None] - points, points - upper[inside, None]), 0.0)
+            inside = inside[np.argsort((gap**2).sum(-1).min(1), kind="stable")[:MOST_SOLIDS]]
+        shapes = obstacles.shapes()
+        shown = [shapes[i] for i in inside.tolist()]
+        ends = [float(value) for value in (*lower[inside, 2], *upper[inside, 2]) if math.isfinite(value)]
+        low, high = min([low, *ends]), max([high, *ends])
+    page = Page.of_size(PAGE_IN, 3.5, credit_of(problem))
+    # mplot3d has no type information.
+    axes = cast(Any, page.axes(0.0, 0.0, PAGE_IN, 3.3, projection="3d", computed_zorder=False))
+    for shape in shown:
+        _draw_solid(axes, shape, low, high)
+    for uav in range(flown.uavs):
+        colour = uav_colour(uav)
+        x, y, z = flown.position[:, uav].T
+        axes.plot(x, y, z, color=colour, linewidth=1.1, zorder=5)
+        axes.plot(x, y, np.full_like(z, low), color=colour, linewidth=0.4, alpha=0.6, zorder=0.5)
+        axes.plot(x[:1], y[:1], z[:1], "o", markersize=3.5, mfc="white", mec=colour, zorder=6)
+        axes.plot(x[-1:], y[-1:], z[-1:], "s", markersize=3.2, color=colour, zorder=6)
+    axes.set(xlim=view.x, ylim=view.y, zlim=(low, high))
+    axes.set_box_aspect((view.width, view.height, high - low), zoom=1.25)
+    axes.view_init(elev=24.0, azim=-68.0)
+    axes.locator_params(axis="y", nbins=4)
+    axes.locator_params(axis="z", nbins=4)
+    axes.set_xlabel("East x (m)", labelpad=12.0)
+    axes.set_ylabel("North y (m)", labelpad=2.0)
+    axes.set_zlabel("Up z (m)", labelpad=-2.0)
+    axes.tick_params(pad=-1.0)
+    for pane in (axes.xaxis, axes.yaxis, axes.zaxis):
+        pane.set_pane_color((1.0, 1.0, 1.0, 0.0))
+        pane._axinfo["grid"].update(color="#E4E4E4", linewidth=0.4)
+    page.text(0.1, 3.48, planner_name(flown.planner), va="top")
+    page.legend(uav_handles(flown.uavs), 3.48)
+    return page.figure
+
+
+def _draw_solid(axes: Any, shape: Shape, low: float, high: float) -> None:
+    if isinstance(shape, Sphere):
+        polar, turn = np.meshgrid(np.linspace(0.0, math.pi, 13), np.linspace(0.0, 2.0 * math.pi, 21))
+        around = np.sin(polar)
+        x = shape.centre_m[0] + shape.radius_m * around * np.cos(turn)
+        y = shape.centre_m[1] + shape.radius_m * around * np.sin(turn)
+        z = shape.centre_m[2] + shape.radius_m * np.cos(polar)
+        axes.plot_surface(x, y, z, color=PALE, alpha=0.75, linewidth=0.0, zorder=2, rcount=13, ccount=21)
+        return
+    if isinstance(shape, Box):
+        base, top = shape.centre_m[2] - 0.5 * shape.size_m[2], shape.centre_m[2] + 0.5 * shape.size_m[2]
+    else:
+        base, top = max(shape.base_m, low), min(shape.top_m, high)
+    for ring in _rings(shape):
+        closed = np.concatenate([ring, ring[:1]])
+        walls = np.stack([np.full(len(closed), base), np.full(len(closed), top)])
+        x, y = np.broadcast_to(closed.T[:, None], (2, 2, len(closed)))
+        axes.plot_surface(
+            x, y, walls, color=PALE, alpha=0.35, linewidth=0.0, zorder=2, rcount=2, ccount=len(closed)
+        )
+        axes.plot(closed[:, 0], closed[:, 1], np.full(len(closed), top), color="#6E6E6E", linewidth=0.4, zorder=3)
+
+
+def _rings(shape: Box | Cylinder | Prism) -> tuple[Array, ...]:
+    if isinstance(shape, Prism):
+        return shape.rings
+    outline = scene.plan_outline(shape)
+    polygon = outline.get_path().to_polygons(outline.get_patch_transform())
+    return (np.asarray(polygon[0], dtype=float)[:-1],)

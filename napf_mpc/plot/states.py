@@ -1,0 +1,208 @@
+"""States of a flight over time: position and velocity, attitude and rates, distances."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from napf_mpc.plot.style import (
+    BLACK,
+    COLUMN_IN,
+    GREY,
+    PAGE_IN,
+    Page,
+    credit_of,
+    planner_name,
+    uav_colour,
+)
+from napf_mpc.plot.tracks import Track, clearances, separations
+from napf_mpc.problem import Problem
+from napf_mpc.world.obstacles import ObstacleSet
+
+Array = NDArray[np.float64]
+
+MAX_LEGEND = 8
+"""Formations up to this size are named in legends."""
+FAR_M = 15.0
+"""Clearances above this are cut off: they say nothing."""
+
+_LEFT, _RIGHT, _BOTTOM, _TOP, _ROW_GAP = 0.52, 0.08, 0.38, 0.26, 0.13
+
+AXES = "xyz"
+ANGLES = ("roll", "pitch", "yaw")
+
+
+def uav_handles(uavs: int) -> list[Line2D]:
+    """Legend entries of the UAVs; none for a formation too large to name."""
+    if uavs > MAX_LEGEND:
+        return []
+    return [Line2D([], [], color=uav_colour(uav), label=f"UAV {uav + 1}") for uav in range(uavs)]
+
+
+def draw_over_time(axes: Axes, time_s: Array, values: Array) -> None:
+    """Draw one line a UAV of values (time, uav)."""
+    for uav in range(values.shape[1]):
+        axes.plot(time_s, values[:, uav], color=uav_colour(uav), linewidth=0.9)
+    axes.set_xlim(0.0, max(float(time_s[-1]), 1e-6))
+    axes.margins(y=0.06)
+    axes.locator_params(axis="y", nbins=5)
+
+
+def _grid(
+    rows: int, columns: int, width: float, row_in: float, gap: float, credit: str, top: float = _TOP
+) -> tuple[Page, list[list[Axes]], float]:
+    """Rows of panels that share the time axis, [row][column] from the top; and the page's height."""
+    height = _BOTTOM + rows * row_in + (rows - 1) * _ROW_GAP + top
+    page = Page.of_size(width, height, credit)
+    wide = (width - _LEFT - _RIGHT - (columns - 1) * gap) / columns
+    panels = []
+    for row in range(rows):
+        bottom = _BOTTOM + (rows - 1 - row) * (row_in + _ROW_GAP)
+        panels.append([page.axes(_LEFT + c * (wide + gap), bottom, wide, row_in) for c in range(columns)])
+    for row, line in enumerate(panels):
+        for axes in line:
+            axes.tick_params(labelbottom=row == rows - 1)
+            if row == rows - 1:
+                axes.set_xlabel("Time (s)")
+    return page, panels, height
+
+
+def motion_figure(problem: Problem, flown: Track) -> Figure:
+    """Position and velocity of every UAV along each axis over time (truth)."""
+    page, panels, height = _grid(3, 2, PAGE_IN, 1.15, 0.62, credit_of(problem))
+    for axis, (left, right) in enumerate(panels):
+        draw_over_time(left, flown.time_s, flown.position[..., axis])
+        draw_over_time(right, flown.time_s, flown.velocity[..., axis])
+        left.set_ylabel(f"{AXES[axis]} (m)")
+        right.set_ylabel(f"$v_{AXES[axis]}$ (m/s)")
+    _heading(page, height, flown)
+    return page.figure
+
+
+def attitude_figure(problem: Problem, flown: Track) -> Figure:
+    """Roll, pitch and yaw of every UAV with their rates over time (truth)."""
+    page, panels, height = _grid(3, 2, PAGE_IN, 1.15, 0.62, credit_of(problem))
+    for axis, (left, right) in enumerate(panels):
+        _draw_angle(left, right, flown, axis)
+        left.set_ylabel(f"{ANGLES[axis].capitalize()} (°)")
+        right.set_ylabel(f"{ANGLES[axis].capitalize()} rate (°/s)")
+    _heading(page, height, flown)
+    return page.figure
+
+
+def _draw_angle(angle: Axes, rate: Axes, flown: Track, axis: int) -> None:
+    draw_over_time(angle, flown.time_s, np.degrees(flown.attitude[..., axis]))
+    draw_over_time(rate, flown.time_s, np.degrees(flown.rates[..., axis]))
+    for axes, least in ((angle, 0.5), (rate, 0.5)):
+        # A yaw that rests at zero must not be blown up to rounding noise.
+        low, high = axes.get_ylim()
+        if high - low < 2.0 * least:
+            axes.set_ylim(min(low, -least), max(high, least))
+
+
+def _heading(page: Page, height: float, flown: Track) -> None:
+    page.text(_LEFT, height - 0.02, planner_name(flown.planner), va="top")
+    page.legend(uav_handles(flown.uavs), height - 0.02)
+
+
+def axis_figure(problem: Problem, flights: Sequence[Track], axis: int) -> Figure:
+    """Position above velocity along one axis, one column a flight (Fig. 6-8, 13-15, 18-20, 23-25)."""
+    page, panels, height = _pair(problem, flights)
+    for column, flown in enumerate(flights):
+        draw_over_time(panels[0][column], flown.time_s, flown.position[..., axis])
+        draw_over_time(panels[1][column], flown.time_s, flown.velocity[..., axis])
+    _share(panels)
+    panels[0][0].set_ylabel(f"{AXES[axis]} (m)")
+    panels[1][0].set_ylabel(f"$v_{AXES[axis]}$ (m/s)")
+    page.legend(uav_handles(flights[0].uavs), height - 0.02)
+    return page.figure
+
+
+def angle_figure(problem: Problem, flights: Sequence[Track], axis: int) -> Figure:
+    """One angle above its rate, one column a flight (Fig. 9-11)."""
+    page, panels, height = _pair(problem, flights)
+    for column, flown in enumerate(flights):
+        _draw_angle(panels[0][column], panels[1][column], flown, axis)
+    _share(panels)
+    panels[0][0].set_ylabel(f"{ANGLES[axis].capitalize()} (°)")
+    panels[1][0].set_ylabel(f"{ANGLES[axis].capitalize()} rate (°/s)")
+    page.legend(uav_handles(flights[0].uavs), height - 0.02)
+    return page.figure
+
+
+def _pair(problem: Problem, flights: Sequence[Track]) -> tuple[Page, list[list[Axes]], float]:
+    several = len(flights) > 1
+    page, panels, height = _grid(
+        2,
+        len(flights),
+        PAGE_IN if several else COLUMN_IN,
+        1.15,
+        0.2,
+        credit_of(problem),
+        top=_TOP + (0.17 if several else 0.0),
+    )
+    if several:
+        for column, flown in enumerate(flights):
+            panels[0][column].set_title(planner_name(flown.planner), pad=3.0)
+    return page, panels, height
+
+
+def _share(panels: list[list[Axes]]) -> None:
+    """Give the panels of a row one scale, so that flights can be compared by eye."""
+    for line in panels:
+        low = min(axes.get_ylim()[0] for axes in line)
+        high = max(axes.get_ylim()[1] for axes in line)
+        end = max(axes.get_xlim()[1] for axes in line)
+        for column, axes in enumerate(line):
+            axes.set(ylim=(low, high), xlim=(0.0, end))
+            axes.tick_params(labelleft=column == 0)
+
+
+def distance_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figure:
+    """Clearance to the nearest obstacle and distance to the nearest UAV over time, with the lines of contact."""
+    lone = flown.uavs == 1
+    rows = 1 if lone else 2
+    page, panels, height = _grid(rows, 1, COLUMN_IN, 1.3, 0.0, credit_of(problem))
+    vehicle = problem.vehicle
+    clearance = clearances(flown, obstacles, vehicle.radius_m)
+    axes = panels[0][0]
+    _draw_distance(axes, flown.time_s, clearance, 0.0, "contact")
+    axes.set_ylabel("Clearance to\nobstacle (m)")
+    if not np.isfinite(clearance).any():
+        axes.text(0.5, 0.5, "no obstacles", transform=axes.transAxes, ha="center", color=GREY)
+    if not lone:
+        axes = panels[1][0]
+        _draw_distance(
+            axes, flown.time_s, separations(flown), vehicle.min_separation_m, f"contact: {vehicle.min_separation_m:g} m"
+        )
+        axes.set_ylabel("Distance to\nnearest UAV (m)")
+    page.legend(uav_handles(flown.uavs), height - 0.02)
+    return page.figure
+
+
+def _draw_distance(axes: Axes, time_s: Array, values: Array, limit: float, words: str) -> None:
+    finite = values[np.isfinite(values)]
+    draw_over_time(axes, time_s, np.where(np.isfinite(values), values, np.nan))
+    high = min(FAR_M, float(finite.max()) if len(finite) else 1.0)
+    low = min(limit, float(finite.min()) if len(finite) else 0.0)
+    pad = 0.08 * (high - low)
+    axes.set_ylim(low - max(pad, 0.3), max(high, limit + 1.0))
+    style: dict[str, Any] = {"color": BLACK, "linewidth": 0.8, "linestyle": (0, (4, 2)), "zorder": 5}
+    axes.axhline(limit, **style)
+    axes.annotate(
+        words,
+        (1.0, limit),
+        xycoords=("axes fraction", "data"),
+        xytext=(-2, 2),
+        textcoords="offset points",
+        ha="right",
+        va="bottom",
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8},
+        zorder=6,
+    )

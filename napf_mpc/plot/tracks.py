@@ -1,0 +1,221 @@
+"""One flight out of a table of trajectories, and what figures derive from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.errors import DataError
+from napf_mpc.navigation.fix import diagonal
+from napf_mpc.problem import Problem
+from napf_mpc.safety_distance import Inflation
+from napf_mpc.world.obstacles import ObstacleSet
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Track:
+    """Recorded flight of all UAVs in one run with one planner; arrays are (time, uav, axis)."""
+
+    planner: str
+    """Who planned."""
+    run: int
+    """Index of the run."""
+    time_s: Array
+    """(time,) [s]."""
+    position: Array
+    """Truth [m]."""
+    velocity: Array
+    """Truth [m/s]."""
+    estimate: Array
+    """Position as navigation reported it [m]."""
+    sigma: Array
+    """Standard deviation of each axis as reported [m]."""
+    attitude: Array
+    """Roll, pitch, yaw [rad]."""
+    rates: Array
+    """Their rates [rad/s]."""
+
+    @property
+    def uavs(self) -> int:
+        """Number of UAVs."""
+        return self.position.shape[1]
+
+
+def track(trajectories: Mapping[str, NDArray[Any]], planner: str, run: int) -> Track:
+    """Flight of one planner in one run.
+
+    Parameters
+    ----------
+    trajectories : mapping of str to array
+        Columns as :class:`napf_mpc.record.TrajectoryRecorder` keeps them.
+    planner : str
+        Name in the ``planner`` column.
+    run : int
+        Index in the ``run`` column.
+
+    Raises
+    ------
+    DataError
+        If the table does not hold this flight, or a time lacks a UAV.
+    """
+    if not trajectories or len(trajectories["run"]) == 0:
+        raise DataError("trajectories: the table is empty; record the flight (record_every >= 1)")
+    rows = np.flatnonzero((trajectories["planner"] == planner) & (trajectories["run"] == run))
+    if len(rows) == 0:
+        known = sorted({str(name) for name in trajectories["planner"]})
+        raise DataError(f'trajectories: no row of planner "{planner}" in run {run}; planners: {", ".join(known)}')
+    uav = np.asarray(trajectories["uav"][rows], dtype=np.int64)
+    rows = rows[np.lexsort((uav, trajectories["t_s"][rows]))]
+    uavs = int(uav.max()) + 1
+    if len(rows) % uavs or (trajectories["uav"][rows] != np.tile(np.arange(uavs), len(rows) // uavs)).any():
+        raise DataError(f'trajectories: planner "{planner}", run {run}: some time lacks a UAV')
+
+    def vectors(pattern: str, axes: tuple[str, ...]) -> Array:
+        columns = [np.asarray(trajectories[pattern.format(axis)][rows], dtype=float) for axis in axes]
+        return np.stack(columns, axis=-1).reshape(-1, uavs, 3)
+
+    xyz, angles = ("x", "y", "z"), ("roll", "pitch", "yaw")
+    return Track(
+        planner=planner,
+        run=run,
+        time_s=np.asarray(trajectories["t_s"][rows], dtype=float).reshape(-1, uavs)[:, 0],
+        position=vectors("{}_m", xyz),
+        velocity=vectors("v{}_mps", xyz),
+        estimate=vectors("est_{}_m", xyz),
+        sigma=vectors("sigma_{}_m", xyz),
+        attitude=vectors("{}_rad", angles),
+        rates=vectors("{}_rate_radps", angles),
+    )
+
+
+def first_run(trajectories: Mapping[str, NDArray[Any]]) -> int:
+    """Lowest run in a table."""
+    if not trajectories or len(trajectories["run"]) == 0:
+        raise DataError("trajectories: the table is empty; record the flight (record_every >= 1)")
+    return int(np.min(trajectories["run"]))
+
+
+def inflation_of(problem: Problem, planner: str) -> Inflation:
+    """How a planner inflates obstacles; the original APF does not."""
+    return Inflation(0.0) if planner == "apf" else Inflation.of_planner(problem.planner)
+
+
+@dataclass(frozen=True)
+class Encounter:
+    """How a UAV saw an obstacle when it believed itself closest to it."""
+
+    obstacle: int
+    """Index of the obstacle in its scene."""
+    uav: int
+    """Which UAV."""
+    sample: int
+    """Index into the track's times."""
+    margin_m: float
+    """k sigma by which the obstacle was inflated [m]."""
+
+
+def encounters(problem: Problem, flown: Track, obstacles: ObstacleSet, each_uav: bool = False) -> list[Encounter]:
+    """Obstacles that acted on a UAV, each at the moment of the closest approach as the planner saw it.
+
+    The planner sees the estimate and the reported sigma. Trajectories hold the sigma of each axis and no
+    covariance between axes, so the margin along an oblique direction leaves that covariance out.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its planner section holds k and the reading of sigma.
+    flown : Track
+        The flight.
+    obstacles : ObstacleSet
+        One scene.
+    each_uav : bool
+        One encounter for each UAV and obstacle, else only that of the UAV that came closest.
+
+    Returns
+    -------
+    list of Encounter
+        By obstacle, then UAV.
+    """
+    inflation = inflation_of(problem, flown.planner)
+    usable = (np.isfinite(flown.estimate) & np.isfinite(flown.sigma)).all(-1).ravel()
+    picks = np.flatnonzero(usable)
+    if len(picks) == 0 or len(obstacles) == 0:
+        return []
+    points = flown.estimate.reshape(-1, 3)[picks]
+    covariance = diagonal(flown.sigma.reshape(-1, 3)[picks] ** 2)
+    reach = problem.planner.influence_m + problem.vehicle.radius_m + inflation.largest_margin(covariance)
+    near = obstacles.near(points[None], reach[None])
+    margin = inflation.margin(covariance, near.gradient[0])
+    rho = near.distance[0] - problem.vehicle.radius_m - margin
+    row, slot = np.nonzero(rho < problem.planner.influence_m)
+    best: dict[tuple[int, int], tuple[float, Encounter]] = {}
+    for i, j in zip(row.tolist(), slot.tolist(), strict=True):
+        sample, uav = divmod(int(picks[i]), flown.uavs)
+        obstacle = int(near.index[0, i, j])
+        key = (obstacle, uav if each_uav else -1)
+        if key not in best or rho[i, j] < best[key][0]:
+            best[key] = (float(rho[i, j]), Encounter(obstacle, uav, sample, float(margin[i, j])))
+    return [best[key][1] for key in sorted(best)]
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Deepest point of one contact of a UAV with an obstacle, on the truth."""
+
+    uav: int
+    """Which UAV."""
+    time_s: float
+    """When [s]."""
+    position: Array
+    """(3,) where [m]."""
+    clearance_m: float
+    """Clearance there, below zero [m]."""
+
+
+def clearances(flown: Track, obstacles: ObstacleSet, radius_m: float) -> Array:
+    """Clearance (time, uav) between each UAV's hull and the nearest obstacle, on the truth; +inf without any [m]."""
+    distance = obstacles.signed_distance(flown.position.reshape(1, -1, 3))
+    return distance.reshape(flown.position.shape[:2]) - radius_m
+
+
+def separations(flown: Track) -> Array:
+    """Distance (time, uav) between the centres of each UAV and its nearest neighbour; +inf for a lone one [m]."""
+    out = np.full(flown.position.shape[:2], np.inf)
+    for i in range(flown.uavs):
+        gaps = np.sqrt(((flown.position - flown.position[:, i : i + 1]) ** 2).sum(-1))
+        gaps[:, i] = np.inf
+        out[:, i] = gaps.min(-1)
+    return out
+
+
+SUBSTEPS = 8
+"""Points looked at between two recorded samples, so that a graze between them is seen as well."""
+
+
+def contacts(flown: Track, obstacles: ObstacleSet, radius_m: float) -> list[Contact]:
+    """Contacts of a flight, each at its deepest point, by UAV and time."""
+    if len(obstacles) == 0:
+        return []
+    fine = np.linspace(0.0, len(flown.time_s) - 1.0, (len(flown.time_s) - 1) * SUBSTEPS + 1)
+    low = np.minimum(fine.astype(int), max(0, len(flown.time_s) - 2))
+    share = fine - low
+    high = np.minimum(low + 1, len(flown.time_s) - 1)
+    time = flown.time_s[low] + share * (flown.time_s[high] - flown.time_s[low])
+    position = flown.position[low] + share[:, None, None] * (flown.position[high] - flown.position[low])
+    clearance = obstacles.signed_distance(position.reshape(1, -1, 3)).reshape(position.shape[:2]) - radius_m
+    found = []
+    for uav in range(flown.uavs):
+        inside = clearance[:, uav] < 0.0
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
+        for start, stop in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            deepest = start + int(np.argmin(clearance[start:stop, uav]))
+            found.append(
+                Contact(uav, float(time[deepest]), position[deepest, uav], float(clearance[deepest, uav]))
+            )
+    return found

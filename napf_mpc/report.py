@@ -1,0 +1,141 @@
+"""Tables of results for the terminal and as Markdown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from napf_mpc.evaluate import Outcome
+from napf_mpc.problem import Reference
+from napf_mpc.risk import wilson
+
+METRIC_LABELS = {
+    "path_rms_m": "path RMS [m]",
+    "shape_rms_m": "shape RMS [m]",
+    "shape_floor_m": "  its floor: navigation alone [m]",
+    "path_length_ratio": "path length ratio",
+    "control_effort": "control effort [N² s]",
+    "reform_time_s": "time to re-form [s]",
+    "finish_time_s": "finish time [s]",
+    "min_clearance_m": "least clearance [m]",
+    "min_separation_m": "least separation [m]",
+}
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A table as text: what a terminal and a Markdown file both show."""
+
+    title: str
+    """Heading."""
+    header: tuple[str, ...]
+    """Column names."""
+    rows: tuple[tuple[str, ...], ...]
+    """Cells."""
+    notes: tuple[str, ...]
+    """Lines below."""
+
+    def markdown(self) -> str:
+        """Return the table as Markdown."""
+        lines = [f"## {self.title}", "", "| " + " | ".join(self.header) + " |"]
+        lines.append("|" + "|".join([" --- ", *[" ---: "] * (len(self.header) - 1)]) + "|")
+        lines += ["| " + " | ".join(row) + " |" for row in self.rows]
+        return "\n".join([*lines, "", *self.notes, ""])
+
+    def print(self, console: Console) -> None:
+        """Print the table on a terminal."""
+        table = Table(title=self.title, title_justify="left")
+        for i, name in enumerate(self.header):
+            table.add_column(name, justify="left" if i == 0 else "right", no_wrap=i > 0)
+        for row in self.rows:
+            table.add_row(*row)
+        console.print(table)
+        for note in self.notes:
+            console.print(note, markup=False, highlight=False)
+
+
+def comparison(summary: dict[str, Any], reference: Reference | None = None) -> Rows:
+    """Table 1 for any problem: planners side by side, every rate with k, n and interval."""
+    planners: dict[str, dict[str, Any]] = summary["planners"]
+    runs = next(iter(planners.values()))["runs"]
+    rows = [
+        ("collision risk, any UAV and obstacle", *[_rate(p, "collision_risk") for p in planners.values()])
+    ]
+    if reference is not None:
+        published: dict[str, float] = dict(reference.collision_risk)  # type: ignore[arg-type]
+        cells = []
+        for name in planners:
+            value = published.get(name)
+            cells.append("" if value is None else f"{100 * value:.2f} % (n = {reference.runs})")
+        rows.append((f"  {reference.source}", *cells))
+    rows.append(("  of one UAV", *[_rate(p, "uav_collision_risk") for p in planners.values()]))
+    rows.append(("UAV-UAV contact", *[_rate(p, "uav_contact_risk") for p in planners.values()]))
+    for outcome in Outcome:
+        rows.append((f"{outcome}", *[f"{p[str(outcome)]} of {p['runs']}" for p in planners.values()]))
+    for key, label in (("finished", "finished, contacts or not"), ("joint_success", "joint success")):
+        rows.append((label, *[_fraction(p[key], p["runs"]) for p in planners.values()]))
+    for key, label in METRIC_LABELS.items():
+        rows.append((label, *[_quantiles(p[key]) for p in planners.values()]))
+    notes = [
+        f"N = {runs} runs a planner, seed {summary['seed']}, the same scenes and errors for all.",
+        "In brackets: 95 % intervals (Wilson; of one UAV: allowing for shared fates); metrics: 5 and 95 %.",
+        "joint success: reached, no contact of either kind, re-formed after the last obstacle.",
+    ]
+    notes += [_pair(pair) for pair in summary["paired"]]
+    if reference is not None:
+        notes += [_reference_note(reference)]
+    return Rows(str(summary["problem"]), ("", *planners), tuple(rows), tuple(notes))
+
+
+def _rate(planner: dict[str, Any], key: str) -> str:
+    low, high = 100 * planner[f"{key}_low"], 100 * planner[f"{key}_high"]
+    return f"{100 * planner[key]:.2f} % [{low:.2f}, {high:.2f}]"
+
+
+def _fraction(value: float, runs: int) -> str:
+    rate = wilson(round(value * runs), runs)
+    return f"{100 * value:.1f} % [{100 * rate.low:.1f}, {100 * rate.high:.1f}]"
+
+
+def _quantiles(q: dict[str, Any]) -> str:
+    if not q["n"]:
+        return "not defined"
+    return f"{q['median']:.2f} [{q['p05']:.2f}, {q['p95']:.2f}]"
+
+
+def _pair(pair: dict[str, Any]) -> str:
+    a, b = pair["a"], pair["b"]
+    return (
+        f"{a} against {b}, same runs: both hit in {pair['both']}, only {a} in {pair['only_a']}, only {b} in "
+        f"{pair['only_b']}, neither in {pair['neither']}; exact McNemar p = {pair['p_value']:.2g}, "
+        f"corrected for the number of pairs {pair['p_value_corrected']:.2g}."
+    )
+
+
+def _reference_note(reference: Reference) -> str:
+    intervals = []
+    for name, value in reference.collision_risk.items():
+        rate = wilson(round(value * reference.runs), reference.runs)
+        intervals.append(f"{name} {100 * rate.low:.1f}-{100 * rate.high:.1f} %")
+    words = f"{reference.source}: its {reference.runs} runs alone allow {', '.join(intervals)} (95 % Wilson)."
+    return f"{words} {reference.note}".strip()
+
+
+def mission_table(row: dict[str, Any], name: str) -> Rows:
+    """Outcome and metrics of one mission."""
+    cells = [("outcome", str(row["outcome"]))]
+    cells.append(("obstacle contact", f"{int(row['uavs_hit'])} of {int(row['uavs'])} UAVs"))
+    cells.append(("UAV-UAV contact", "yes" if row["uav_contact"] else "no"))
+    cells.append(("joint success", "yes" if row["joint_success"] else "no"))
+    for key, label in METRIC_LABELS.items():
+        value = float(row[key])
+        cells.append((label, f"{value:.2f}" if value == value else "not defined"))
+    return Rows(
+        f"{name}, planner {row['planner']}, run {row['run']} of seed {row['seed']}",
+        ("", "value"),
+        tuple(cells),
+        (),
+    )
