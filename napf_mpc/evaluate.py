@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -14,6 +15,8 @@ from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.planner import Command
 from napf_mpc.problem import Problem
 from napf_mpc.simulate import POSITION, Flight, Mask, Scenario, formation_mission
+from napf_mpc.vehicle.quadrotor import hover_input
+from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 from napf_mpc.world.sweep import SweptClearance, swept_separation
 
 Array = NDArray[np.float64]
@@ -102,27 +105,20 @@ class MissionScore:
 
     def _last_obstacle_along(self) -> Array:
         """Along-track place (run,) where the last obstacle in the formation's corridor ends; NaN if none."""
-        half_width = float(np.abs(self._offsets[:, 1]).max()) + self._problem.planner.influence_m
-        length = formation_mission(self._problem).length_m
-        out = np.full(len(self._scenario.runs), np.nan)
-        for scene in range(self._scenario.obstacles.n_scenes):
-            low, high = self._scenario.obstacles.scene(scene).bounds()
-            if len(low) == 0:
-                continue
-            corners = np.stack(
-                [np.where(np.array(pick, dtype=bool), low, high) for pick in np.ndindex(2, 2, 2)], axis=0
-            )
-            # An endless cylinder has no height; only its place along and across the path counts.
-            path = self._frame.to_path(np.where(np.isfinite(corners), corners, self._frame.origin[2]))
-            inside = (path[..., 1].min(0) <= half_width) & (path[..., 1].max(0) >= -half_width)
-            inside &= (path[..., 0].min(0) <= length) & (path[..., 0].max(0) >= 0.0)
-            if inside.any():
-                far = float(path[..., 0].max(0)[inside].max())
-                if self._scenario.obstacles.n_scenes == 1:
-                    out[:] = far
-                else:
-                    out[scene] = far
-        return out
+        obstacles, runs = self._scenario.obstacles, len(self._scenario.runs)
+        length, reach = formation_mission(self._problem).length_m, self._problem.planner.influence_m
+        half_width = float(np.abs(self._offsets[:, 1]).max()) + reach
+        places = self._offsets * np.array([0.0, 0.0, 1.0])
+        heights = self._frame.to_world(np.concatenate([places, places + np.array([length, 0.0, 0.0])]))[:, 2]
+        ends = np.full(obstacles.n_scenes, np.nan)
+        for scene in range(obstacles.n_scenes):
+            for shape in obstacles.shapes(scene):
+                near, far, right, left, base, top = _plan_extent(shape, self._frame)
+                beside = right > half_width or left < -half_width
+                above_or_below = base > heights.max() + reach or top < heights.min() - reach
+                if not (beside or above_or_below or near > length or far < 0.0):
+                    ends[scene] = np.fmax(ends[scene], far)
+        return np.broadcast_to(ends, runs).copy()
 
     def moved(self, time_s: float, before: Array, after: Array, active: Mask) -> None:
         """Sweep one physics step against the solids and the other UAVs."""
@@ -151,7 +147,7 @@ class MissionScore:
             self._frame.origin,
             self._frame.axes,
             self._offsets,
-            self._problem.vehicle.mass_kg * 9.81,
+            float(hover_input(self._problem.vehicle)[0]),
             formation_mission(self._problem).reform_bound_m,
             self._last_obstacle,
             self._sums,
@@ -207,6 +203,36 @@ class MissionScore:
             flight.reached & ~flight.failed,
             metrics,
         )
+
+
+def _plan_extent(shape: Shape, frame: PathFrame) -> tuple[float, float, float, float, float, float]:
+    """Where a solid lies beside a path: near and far end along it, right, left [m]; height of base and top.
+
+    Seen from above: where the path climbs, the ends are those of its points over the solid.
+    """
+    radius = 0.0
+    match shape:
+        case Sphere():
+            outline, radius = np.array([shape.centre_m[:2]]), shape.radius_m
+            base, top = shape.centre_m[2] - radius, shape.centre_m[2] + radius
+        case Cylinder():
+            outline, radius = np.array([shape.centre_m]), shape.radius_m
+            base, top = shape.base_m, shape.top_m
+        case Box():
+            x, y, z = shape.centre_m
+            half = 0.5 * np.array(shape.size_m)
+            c, s = math.cos(shape.heading_rad), math.sin(shape.heading_rad)
+            corners = half[:2] * np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
+            outline = corners @ np.array([(c, s), (-s, c)]) + np.array([x, y])
+            base, top = z - half[2], z + half[2]
+        case Prism():
+            outline, base, top = np.concatenate(shape.rings), shape.base_m, shape.top_m
+    offset = outline - frame.origin[:2]
+    lateral = offset[:, 0] * frame.left[0] + offset[:, 1] * frame.left[1]
+    ahead = offset[:, 0] * frame.left[1] - offset[:, 1] * frame.left[0]
+    slope = math.hypot(frame.along[0], frame.along[1])
+    near, far = (ahead.min() - radius) / slope, (ahead.max() + radius) / slope
+    return near, far, lateral.min() - radius, lateral.max() + radius, base, top
 
 
 def _finite_or_nan(values: Array) -> Array:

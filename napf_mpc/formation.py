@@ -37,7 +37,17 @@ class PathFrame:
     def from_angles(
         cls, origin: tuple[float, float, float], heading_rad: float, climb_rad: float
     ) -> PathFrame:
-        """Frame of a path with a heading (counter-clockwise from east) and a climb angle [rad]."""
+        """Frame of a path with a heading (counter-clockwise from east) and a climb angle [rad].
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        if not np.isfinite([*origin, heading_rad, climb_rad]).all():
+            raise ValueError(
+                f"origin = {origin}, heading_rad = {heading_rad!r}, climb_rad = {climb_rad!r} must be finite"
+            )
         ch, sh = _cos_sin(heading_rad)
         cc, sc = _cos_sin(climb_rad)
         along = np.array([ch * cc, sh * cc, sc])
@@ -107,21 +117,24 @@ def square_geometry(side_m: float, first_lane_m: float) -> SquareGeometry:
 
     ``alpha = asin(sqrt(2) |p_1y| / s)``, ``beta = 45 deg - alpha``; lanes ``p_1y, -p_1y, -p_1y - s sin(beta),
     p_1y + s sin(beta)``; offsets ``(c, -c, d, -d)`` with ``c = s / sqrt(2) cos(alpha)`` and
-    ``d = s / sqrt(2) sin(alpha)``. UAV 1-2 and 3-4 are the diagonals.
+    ``d = s / sqrt(2) sin(alpha)``. UAV 1-2 and 3-4 are the diagonals. A negative first lane gives the mirror
+    image.
 
     Raises
     ------
     ValueError
-        If the first lane lies outside the square's half diagonal.
+        If the side is not a positive number, or the first lane lies outside the square's half diagonal.
     """
-    ratio = math.sqrt(2.0) * abs(first_lane_m) / side_m
-    if not 0.0 <= ratio <= 1.0:
-        raise ValueError(f"first_lane_m = {first_lane_m:g} must be within side_m / sqrt(2), side {side_m:g}")
-    alpha = math.asin(ratio)
+    half_diagonal = side_m / math.sqrt(2.0)
+    if not (0.0 < side_m < math.inf and abs(first_lane_m) <= half_diagonal):
+        raise ValueError(
+            f"side_m = {side_m:g} must be > 0 and first_lane_m = {first_lane_m:g} within side_m / sqrt(2)"
+        )
+    alpha = math.asin(min(1.0, abs(first_lane_m) / half_diagonal))
     beta = math.pi / 4.0 - alpha
-    c = side_m / math.sqrt(2.0) * math.cos(alpha)
-    d = side_m / math.sqrt(2.0) * math.sin(alpha)
-    outer = first_lane_m + side_m * math.sin(beta)
+    c = half_diagonal * math.cos(alpha)
+    d = half_diagonal * math.sin(alpha)
+    outer = first_lane_m + math.copysign(side_m, first_lane_m) * math.sin(beta)
     return SquareGeometry(
         alpha, beta, np.array([first_lane_m, -first_lane_m, -outer, outer]), np.array([c, -c, d, -d])
     )

@@ -127,7 +127,8 @@ def _lines(details: ErrorDetails) -> Iterator[str]:
     path, places = _walk(details["loc"])
     if path and path[-1] == "[key]":  # pydantic's mark for the name of a free table's key
         names = get_args(_Place.of(get_args(places[-3].annotation)[0]).annotation) if places[-3] else ()
-        yield f"{shown_key_path(path[:-1])}: unknown key; must be {_choice(names)}{did_you_mean(str(value), names)}"
+        near = did_you_mean(str(value), names)
+        yield f"{shown_key_path(path[:-1])}: unknown key; must be {_choice(names)}{near}"
         return
     place = places[-1]
     key = shown_key_path(path)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,8 @@ def confidence_factor(confidence: float, dimensions: int = 1) -> float:
     """
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence = {confidence!r} must be > 0 and < 1")
-    if dimensions < 1:
-        raise ValueError(f"dimensions = {dimensions!r} must be >= 1")
+    if dimensions < 1 or dimensions != int(dimensions):
+        raise ValueError(f"dimensions = {dimensions!r} must be a whole number >= 1")
     return math.sqrt(2.0 * float(special.gammaincinv(dimensions / 2.0, confidence)))
 
 
@@ -66,12 +66,16 @@ def directional_sigma(covariance: Array, normal: Array) -> Array:
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-def axis_sigma(covariance: Array, reading: Literal["largest", "rms"]) -> Array:
-    """Standard deviation without a direction, (...) [m]: the largest axis' or the axes' root mean square."""
-    variances = np.stack([covariance[..., 0, 0], covariance[..., 1, 1], covariance[..., 2, 2]], axis=-1)
-    if reading == "largest":
-        return np.asarray(np.sqrt(variances.max(-1)))
-    return np.asarray(np.sqrt((variances[..., 0] + variances[..., 1] + variances[..., 2]) / 3.0))
+def largest_sigma(covariance: Array) -> Array:
+    """Standard deviation (...) along the ellipsoid's largest axis, in no direction exceeded [m]."""
+    # Matrix by matrix, so the last bit does not depend on the batch.
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., -1], 0.0)))
+
+
+def rms_sigma(covariance: Array) -> Array:
+    """Root mean square (...) of the standard deviations of the axes [m]."""
+    trace = covariance[..., 0, 0] + covariance[..., 1, 1] + covariance[..., 2, 2]
+    return np.asarray(np.sqrt(np.maximum(trace, 0.0) / 3.0))
 
 
 def clearance_margin(covariance: Array, normal: Array, confidence: float) -> Array:
@@ -103,8 +107,9 @@ def clearance_margin(covariance: Array, normal: Array, confidence: float) -> Arr
     normal = np.asarray(normal, dtype=float)
     if not (np.isfinite(covariance).all() and np.isfinite(normal).all()):
         raise ValueError("covariance and normal must be finite")
-    lowest = float(np.linalg.eigvalsh(covariance).min())
-    if lowest < -1e-9 * max(1.0, float(np.abs(covariance).max())):
+    symmetric = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
+    lowest = float(np.linalg.eigvalsh(symmetric).min(initial=0.0))
+    if lowest < -1e-9 * max(1.0, float(np.abs(covariance).max(initial=0.0))):
         raise ValueError(
             f"covariance has the negative eigenvalue {lowest:g}; it must be positive semidefinite"
         )
@@ -122,6 +127,17 @@ class Inflation:
     reading: SigmaReading = "directional"
     """Which sigma."""
 
+    def __post_init__(self) -> None:
+        # A factor of NaN would make every comparison with rho_0 False: "no obstacle".
+        if not (math.isfinite(self.k) and self.k >= 0.0):
+            raise ValueError(f"k = {self.k!r} must be a finite number >= 0")
+        for name, value, choices in (
+            ("mode", self.mode, ("shift", "range")),
+            ("reading", self.reading, get_args(SigmaReading)),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name} = {value!r} must be one of {', '.join(choices)}")
+
     @classmethod
     def of_planner(cls, planner: Planner) -> Inflation:
         """Inflation as a problem's planner section asks for it."""
@@ -134,14 +150,13 @@ class Inflation:
     def margin(self, covariance: Array, normal: Array) -> Array:
         """Inflation k sigma [m]: covariance (..., 3, 3) against normals (..., m, 3) gives (..., m)."""
         if self.reading in ("largest", "rms"):
-            sigma = axis_sigma(covariance, "largest" if self.reading == "largest" else "rms")
+            sigma = largest_sigma(covariance) if self.reading == "largest" else rms_sigma(covariance)
             return np.broadcast_to(self.k * sigma[..., None], normal.shape[:-1])
         return self.k * directional_sigma(covariance[..., None, :, :], normal)
 
     def largest_margin(self, covariance: Array) -> Array:
         """Bound (...) on the margin over all directions: k times the root of the covariance's trace [m]."""
-        trace = covariance[..., 0, 0] + covariance[..., 1, 1] + covariance[..., 2, 2]
-        return self.k * np.sqrt(np.maximum(trace, 0.0))
+        return self.k * math.sqrt(3.0) * rms_sigma(covariance)
 
     def apply(self, distance: Array, margin: Array, influence_m: float) -> tuple[Array, Array]:
         """Distance and range that enter Eq. 23 and 28, each (...) [m]: (rho_eff, rho_0)."""

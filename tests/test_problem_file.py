@@ -170,6 +170,7 @@ def test_byte_order_mark_and_windows_line_ends_are_read(tmp_path: Path) -> None:
 WORLDS = '"empty", "list", "lanes", "scatter", "forest", "street_canyon" or "city"'
 SHAPES = '"sphere", "cylinder", "box" or "prism"'
 REFERENCE = "{ source = 'a', runs = 3, collision_risk = "
+PLANNERS = '"apf", "napf" or "qp"'
 ERRORS = '"gauss_markov", "constant" or "recorded"'
 
 
@@ -191,7 +192,7 @@ ERRORS = '"gauss_markov", "constant" or "recorded"'
         ("world.obstacles[1]", "4", f" = 4: must be a table with shape = {SHAPES}"),
         ("navigation.kind", "gnss", f' = "gnss": not built in this version; must be {ERRORS}'),
         ("navigation.filter", "kalman", ' = "kalman": "kalman" is not built in this version; use "none"'),
-        ("planner.kind", "nafp", ' = "nafp": must be "apf", "napf" or "qp"; did you mean napf?'),
+        ("planner.kind", "nafp", f' = "nafp": must be {PLANNERS}; did you mean napf?'),
         ("planner.confidence", "1.0", " = 1.0: must be > 0 and < 1"),
         (
             "vehicle.lqr_q_diagonal",
@@ -209,9 +210,13 @@ ERRORS = '"gauss_markov", "constant" or "recorded"'
             ": first_lane_m = 8 must be <= side_m / sqrt(2)",
         ),
         ("planner", "3", " = 3: must be a table with the keys kind, rate_hz"),
-        ("reference", REFERENCE + "{ apff = 0.5 } }", '.collision_risk.apff: unknown key; must be "apf", "napf" or "qp"'),
+        (
+            "reference",
+            REFERENCE + "{ apff = 0.5 } }",
+            f".collision_risk.apff: unknown key; must be {PLANNERS}",
+        ),
         ("reference", REFERENCE + "{ apf = 5 } }", ".collision_risk.apf = 5: must be >= 0 and <= 1"),
-        ("reference", REFERENCE + "5 }", '.collision_risk = 5: must be a table with keys out of "apf", "napf" or "qp"'),
+        ("reference", REFERENCE + "5 }", f".collision_risk = 5: must be a table with keys out of {PLANNERS}"),
         ("planner.rate_hz", "7", " = 7 must divide 50 Hz a whole number of times"),
         (
             "mission.length_m",

@@ -165,8 +165,7 @@ class RecordedErrors:
             age_at_start = np.maximum((share > 0.0) * table.age_s[i], (rest > 0.0) * table.age_s[j])
             age = age_at_start + (time - step * table.period_s)
             growth = np.where(available, 0.0, coasting_variance(age))
-            axes = 3 if self.vertical is None else 2
-            np.einsum("...ii->...i", covariance)[..., :axes] += growth[..., None]
+            np.einsum("...ii->...i", covariance)[...] += growth[..., None]
             factor *= available[..., None, None]
         if self.vertical is not None:
             error[..., 2] = self.vertical[epoch]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +49,7 @@ class PotentialFieldPlanner:
         self._lanes = self._frame.to_world(self._offsets * np.array([0.0, 1.0, 1.0]))
         self._obstacles = ObstacleSet.empty()
         self._anchor: Array = np.zeros((0, 0, 3))
-        self._holding: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
+        self._placed: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
 
     @property
     def name(self) -> str:
@@ -56,21 +57,23 @@ class PotentialFieldPlanner:
         return self._name
 
     def reset(self, obstacles: ObstacleSet, runs: int) -> None:
-        """Take a new map and forget where UAVs were holding."""
+        """Take a new map and forget where UAVs have been."""
         self._obstacles = obstacles
-        self._anchor = np.zeros((runs, len(self._offsets), 3))
-        self._holding = np.zeros((runs, len(self._offsets)), dtype=bool)
+        self._anchor = np.repeat(self._lanes[None], runs, axis=0)
+        self._placed = np.zeros((runs, len(self._offsets)), dtype=bool)
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
         """Command of all UAVs from the reported solution and the map."""
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
         trusted = nav.trusted()
+        self._move_anchors(nav, trusted)
         if trusted.all():
             position, covariance = nav.position, nav.position_covariance
         else:
-            # A solution that is not trusted must not reach the arithmetic, where NaN would spread by u_c.
-            position = np.where(trusted[..., None], nav.position, self._lanes)
+            # What is not trusted must not reach the arithmetic, where NaN would spread to all UAVs by u_c.
+            # The others keep formation with the place where such a UAV holds.
+            position = self._anchor
             covariance = np.where(trusted[..., None, None], nav.position_covariance, np.eye(3))
 
         error = synchronisation_error(self._frame.along_track(position), self._offsets[:, 0])
@@ -96,7 +99,7 @@ class PotentialFieldPlanner:
             holding=~trusted,
             feedforward=np.zeros((*trusted.shape, 4)),
         )
-        return self._hold(command, nav, trusted)
+        return self._hold(command)
 
     def _repulsion(self, position: Array, covariance: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Force on each UAV (run, uav, 3), and whether any obstacle is within its range (run, uav)."""
@@ -112,24 +115,22 @@ class PotentialFieldPlanner:
         )
         return force, np.asarray((rho < influence).any(-1))
 
-    def _hold(self, command: Command, nav: NavSolution, trusted: NDArray[np.bool_]) -> Command:
-        """Hold the last known place where navigation is not to be trusted: never "no obstacle"."""
-        starts = ~trusted & ~self._holding
-        known = np.isfinite(nav.position).all(-1, keepdims=True)
-        self._anchor = np.where(starts[..., None] & known, nav.position, self._anchor)
-        # The newest trusted place serves a solution that is lost together with its numbers.
-        self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
-        self._holding = ~trusted
-        if trusted.all():
+    def _move_anchors(self, nav: NavSolution, trusted: NDArray[np.bool_]) -> None:
+        """Note the last trusted place of each UAV; until there is one, the first that is a number."""
+        known = trusted | (~self._placed & np.isfinite(nav.position).all(-1))
+        self._anchor = np.where(known[..., None], nav.position, self._anchor)
+        self._placed |= known
+
+    def _hold(self, command: Command) -> Command:
+        """Hover at the last trusted place where navigation is not to be trusted: never "no obstacle"."""
+        if not command.holding.any():
             return command
-        lost = ~trusted[..., None]
-        return Command(
+        lost = command.holding[..., None]
+        return replace(
+            command,
             position=np.where(lost, self._anchor, command.position),
             velocity=np.where(lost, 0.0, command.velocity),
             direction=np.where(lost, 0.0, command.direction),
-            yaw=command.yaw,
-            holding=command.holding,
-            feedforward=command.feedforward,
         )
 
 

@@ -29,6 +29,7 @@ from napf_mpc.plot.style import (
 )
 from napf_mpc.plot.tracks import (
     Track,
+    acting,
     clearances,
     contacts,
     encounters,
@@ -49,6 +50,10 @@ SHOWN_APART = 4
 """UAVs that get a panel of their own: those that came closest to an obstacle."""
 ELLIPSE_EVERY_S = 8.0
 """Time between two ellipses."""
+MOST_INFLATED = 6
+"""Inflated obstacles drawn for a UAV: those that it came closest to."""
+_SHOWN_K = 3.0
+"""Sigmas of the ellipses where no planner uses any."""
 
 
 def run_figures(
@@ -107,104 +112,117 @@ def run_figures(
 
 
 def flight_title(problem: Problem, flown: Track) -> str:
-    """Name of the planner and, where it inflates obstacles, by how much."""
-    return planner_title(planner_name(flown.planner), inflation_of(problem, flown.planner))
-
-
-def planner_title(name: str, inflation: Inflation) -> str:
-    """``APF``, ``NAPF, k = 3``, or ``NAPF, range of influence + 3 sigma`` for the other reading."""
+    """``APF``, ``NAPF, k = 3``, or that k widens only the range of influence."""
+    inflation = inflation_of(problem, flown.planner)
+    name = planner_name(flown.planner)
     if inflation.k == 0.0:
         return name
-    return f"{name}, k = {inflation.k:.3g}" + ("" if inflation.mode == "shift" else " on the range of influence")
+    return f"{name}, k = {inflation.k:.3g}" + ("" if inflation.mode == "shift" else " (range)")
 
 
-def paths_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figure:
+def paths_figure(
+    problem: Problem, flown: Track, obstacles: ObstacleSet, beside: Sequence[Track] = ()
+) -> Figure:
     """Paths of all UAVs from above and from the side, with every contact marked.
 
     A path that crosses an obstacle's outline in one view passes beside it in the other; only a mark is a
     contact.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation problem.
+    flown : Track
+        The flight.
+    obstacles : ObstacleSet
+        One scene.
+    beside : sequence of Track
+        Other flights of the same problem whose figures are to have the same scales.
     """
     frame = PathFrame.of_mission(formation_mission(problem))
-    view = scene.view_of(flown.position, obstacles, pad_m=2.0, reach_m=12.0)
+    level = abs(frame.heading_rad) < 1e-9
     few = flown.uavs <= LABELLED
-    left, right, top = 0.5, 0.08, 0.28
+    seen = np.concatenate([each.position.reshape(-1, 3) for each in (flown, *beside)])
+    view = scene.view_of(seen, obstacles, pad_m=2.0, reach_m=12.0)
     label_m = 0.075 * max(view.width, view.height) if few else 0.0
     view = scene.View((view.x[0], view.x[1] + label_m), view.y)
-    along = frame.along_track(flown.position)
-    span = (float(along.min()) - 2.0, float(along.max()) + 2.0 + label_m)
-    heights = flown.position[..., 2]
-    low, high = _height_span(heights, obstacles, view)
+    along = frame.along_track(seen)
+    span = view.x if level else (float(along.min()) - 2.0, float(along.max()) + 2.0)
+    left, right, bottom, gap, top = 0.58, 0.08, 0.4, 0.32, 0.28
     wide = PAGE_IN - left - right
     scale = min(wide / view.width, 5.2 / view.height)
     plan_w, plan_h = scale * view.width, scale * view.height
-    level = abs(frame.heading_rad) < 1e-9
-    side_h = (plan_w / view.width if level else wide / (span[1] - span[0])) * (high - low)
-    side_h = min(max(side_h, 0.6), 2.2)
-    bottom = 0.38
-    page = Page.of_size(PAGE_IN, bottom + side_h + 0.42 + plan_h + top, credit_of(problem))
-    side = page.axes(left, bottom, plan_w if level else wide, side_h)
-    plan = page.axes(left, bottom + side_h + 0.42, plan_w, plan_h)
-    page.text(left, bottom + side_h + 0.42 + plan_h + top - 0.02, flight_title(problem, flown), va="top")
-
+    side_w = plan_w if level else wide
+    metre = side_w / (span[1] - span[0])
+    low, high = _height_span(seen[:, 2], obstacles, view, 0.7 / metre)
+    side_h = min(metre * (high - low), 2.4)
+    if not level:
+        gap += 0.18  # the plan has a label of its own below
+    height = bottom + side_h + gap + plan_h + top
+    page = Page.of_size(PAGE_IN, height, credit_of(problem))
+    side = page.axes(left, bottom, side_w, side_h)
+    plan = page.axes(left, bottom + side_h + gap, plan_w, plan_h)
     plan.set(xlim=view.x, ylim=view.y, ylabel="North y (m)", xlabel="" if level else "East x (m)")
-    side.set(ylim=(low, high), ylabel="Up z (m)")
-    side.set(xlim=view.x if level else span, xlabel="East x (m)" if level else "Along the path (m)")
-    if level:
-        along = flown.position[..., 0]
-    _whole_steps(plan, side)
+    side.set(xlim=span, ylim=(low, high), ylabel="Up z (m)")
+    side.set_xlabel("East x (m)" if level else "Along the path (m)")
+    for axes, width in ((plan, plan_w), (side, side_w)):
+        axes.locator_params(axis="y", nbins=5, steps=[1, 2, 5, 10])
+        axes.yaxis.set_label_coords(-0.42 / width, 0.5)
     scene.draw_plan(plan, obstacles, view)
     scene.draw_side(side, obstacles, frame, view)
-    _draw_paths(plan, flown.position[..., 0], flown.position[..., 1], few)
-    _draw_paths(side, along, heights, few=False)
+    draw_paths(plan, flown.position[..., 0], flown.position[..., 1], label=few)
+    horizontal = flown.position[..., 0] if level else frame.along_track(flown.position)
+    draw_paths(side, horizontal, flown.position[..., 2], label=False)
     found = contacts(flown, obstacles, problem.vehicle.radius_m)
-    for contact in found:
-        mark = {"marker": "X", "s": 34, "color": BLACK, "edgecolor": "white", "linewidth": 0.5, "zorder": 6}
-        plan.scatter(contact.position[0], contact.position[1], **mark)
-        place = contact.position[0] if level else float(frame.along_track(contact.position))
-        side.scatter(place, contact.position[2], **mark)
+    mark_contacts(plan, [(each.position[0], each.position[1]) for each in found])
+    mark_contacts(
+        side,
+        [(each.position[0] if level else float(frame.along_track(each.position)), each.position[2]) for each in found],
+    )
+    page.text(left, height - 0.02, flight_title(problem, flown), va="top")
     handles: list[Any] = [scene.start_mark(), scene.end_mark()]
     if len(obstacles):
         handles.append(scene.obstacle_mark())
     if found:
         handles.append(scene.contact_mark())
-    page.legend(handles, bottom + side_h + 0.42 + plan_h + top - 0.02, x=left + 1.9)
+    page.legend(handles, height - 0.02, x=left + 1.9)
     return page.figure
 
 
-def _height_span(heights: Array, obstacles: ObstacleSet, view: scene.View) -> tuple[float, float]:
-    """Heights to show: the paths and the balls beside them; tall obstacles are cut."""
+def _height_span(
+    heights: Array, obstacles: ObstacleSet, view: scene.View, least_m: float
+) -> tuple[float, float]:
+    """Heights to show: the paths and the low obstacles among them; tall obstacles are cut."""
     low, high = float(heights.min()), float(heights.max())
     if len(obstacles):
         lower, upper = obstacles.boxes
         close = view.shows(lower, upper) & (upper[:, 2] - lower[:, 2] < 20.0)
         if close.any():
             low, high = min(low, float(lower[close, 2].min())), max(high, float(upper[close, 2].max()))
-    return low - 1.0, high + 1.0
+    pad = max(1.0, 0.5 * (least_m - (high - low)))
+    return low - pad, high + pad
 
 
-def _whole_steps(*panels: Axes) -> None:
-    for axes in panels:
-        axes.locator_params(axis="y", nbins=5, steps=[1, 2, 5, 10])
-
-
-def _draw_paths(axes: Axes, x: Array, y: Array, few: bool) -> None:
-    """Path of every UAV with start and end, and labels beside the ends, spread so that none overlaps."""
+def draw_paths(axes: Axes, x: Array, y: Array, label: bool) -> None:
+    """Draw the path of every UAV, (time, uav), with start and end, and on request a label beside each end."""
     uavs = x.shape[1]
     for uav in range(uavs):
         colour = uav_colour(uav)
         axes.plot(x[:, uav], y[:, uav], color=colour, linewidth=1.1 if uavs <= LABELLED else 0.5, zorder=4)
         axes.plot(x[0, uav], y[0, uav], "o", markersize=3.5, mfc="white", mec=colour, mew=0.9, zorder=5)
         axes.plot(x[-1, uav], y[-1, uav], "s", markersize=3.2, color=colour, zorder=5)
-    if not few:
+    if not label:
         return
-    for uav, height in enumerate(spread(y[-1], 0.135 * _metres_per_inch(axes))):
-        axes.text(
-            float(x[-1].max()) + 0.09 * _metres_per_inch(axes),
-            height,
-            f"UAV {uav + 1}",
-            color=uav_colour(uav),
-            va="center",
-        )
+    inch = _metres_per_inch(axes)
+    right = float(x[-1].max()) + 0.09 * inch
+    for uav, height in enumerate(spread(y[-1], 0.135 * inch).tolist()):
+        axes.text(right, height, f"UAV {uav + 1}", color=uav_colour(uav), va="center")
+
+
+def mark_contacts(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
+    """Draw a cross at each contact."""
+    for x, y in places:
+        axes.plot(x, y, "X", markersize=6, mfc=BLACK, mec="white", mew=0.5, zorder=6)
 
 
 def _metres_per_inch(axes: Axes) -> float:
@@ -215,11 +233,10 @@ def _metres_per_inch(axes: Axes) -> float:
 
 
 def spread(places: Array, gap: float) -> Array:
-    """Places (n,) moved apart until neighbours are at least a gap apart, in the same order, around their middle."""
-    order = np.argsort(places, kind="stable")
+    """Move places (n,) apart until neighbours are at least a gap apart, in the same order, around their middle."""
     out = np.array(places, dtype=float)
     groups: list[list[int]] = []
-    for index in order.tolist():
+    for index in np.argsort(places, kind="stable").tolist():
         groups.append([index])
         # A group is laid out evenly around its mean; groups that run into each other become one.
         while len(groups) > 1:
@@ -230,35 +247,35 @@ def spread(places: Array, gap: float) -> Array:
                 break
             groups[-2:] = [below + above]
     for group in groups:
-        middle = float(places[group].mean())
-        out[group] = middle + gap * (np.arange(len(group)) - (len(group) - 1) / 2.0)
+        out[group] = float(places[group].mean()) + gap * (np.arange(len(group)) - (len(group) - 1) / 2.0)
     return out
 
 
 def uncertainty_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figure:
-    """What each UAV believed: its estimate, k-sigma ellipses, and the obstacles as inflated for it, beside its true path.
+    """What each UAV believed beside its true path: estimate, k-sigma ellipses, obstacles as inflated for it.
 
-    Up to four UAVs, those that came closest to an obstacle. An obstacle is drawn inflated by the margin at
-    the moment when the UAV believed itself closest to it.
+    Up to four UAVs, those that came closest to an obstacle, and for each the six obstacles that it believed
+    itself closest to, inflated by the margin of that moment. Seen from above, a path through a dashed
+    circle passes over or under it.
     """
     inflation = inflation_of(problem, flown.planner)
-    k = Inflation.of_planner(problem.planner).k or 3.0
+    k = Inflation.of_planner(problem.planner).k or _SHOWN_K
     shown = _closest_uavs(flown, obstacles)
-    every = max(1, round(ELLIPSE_EVERY_S / max(1e-9, float(np.diff(flown.time_s[:2]).sum()) or ELLIPSE_EVERY_S)))
-    reach = flown.estimate[:, shown][::every]
-    swell = np.where(np.isfinite(flown.sigma[:, shown][::every]), k * flown.sigma[:, shown][::every], 0.0)
-    points = np.concatenate([flown.position[:, shown], reach - swell, reach + swell, flown.estimate[:, shown]])
-    view = scene.view_of(points, obstacles, pad_m=1.0, reach_m=2.0)
+    picks = _every(flown.time_s, ELLIPSE_EVERY_S)
+    centre, swell = flown.estimate[picks][:, shown], k * flown.sigma[picks][:, shown]
+    points = [flown.position[:, shown], centre - swell, centre + swell, flown.estimate[:, shown]]
+    view = scene.view_of(np.concatenate(points), obstacles, pad_m=1.0, reach_m=2.0)
     columns = 1 if len(shown) == 1 else 2
     rows = -(-len(shown) // columns)
-    left, right, gap, bottom, top, title = 0.5, 0.08, 0.14, 0.38, 0.26, 0.2
+    left, right, gap, bottom, top, title = 0.58, 0.08, 0.14, 0.4, 0.24, 0.2
     wide = (PAGE_IN - left - right - gap * (columns - 1)) / columns
-    tall = min(wide * view.height / view.width, 3.2)
-    wide = min(wide, tall * view.width / view.height)
+    scale = min(wide / view.width, 3.2 / view.height)
+    wide, tall = scale * view.width, scale * view.height
     height = bottom + rows * (tall + title) + top
     page = Page.of_size(PAGE_IN, height, credit_of(problem))
-    seen = encounters(problem, flown, obstacles, each_uav=True) if inflation.k > 0.0 else []
-    shapes = obstacles.shapes() if len(obstacles) else []
+    inflates = inflation.k > 0.0 and inflation.mode == "shift" and len(obstacles) > 0
+    seen = acting(problem, flown, obstacles) if inflates else None
+    shapes = obstacles.shapes() if inflates else []
     for place, uav in enumerate(shown):
         row, column = divmod(place, columns)
         axes = page.axes(
@@ -271,32 +288,31 @@ def uncertainty_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -
         axes.set_ylabel("North y (m)" if column == 0 else "")
         axes.tick_params(labelbottom=last_in_column, labelleft=column == 0)
         scene.draw_plan(axes, obstacles, view)
-        for encounter in seen:
-            if encounter.uav == uav:
-                scene.draw_inflated(
-                    axes,
-                    shapes[encounter.obstacle],
-                    encounter.margin_m,
-                    float(flown.estimate[encounter.sample, uav, 2]),
-                )
-        scene.draw_ellipses(axes, flown.estimate[::every, uav], flown.sigma[::every, uav], k, uav_colour(uav))
+        if seen is not None:
+            for entry in encounters(seen, uav, MOST_INFLATED):
+                flight_height = float(flown.estimate[seen.sample[entry], uav, 2])
+                shape, margin = shapes[int(seen.obstacle[entry])], float(seen.margin_m[entry])
+                scene.draw_inflated(axes, shape, margin, flight_height)
+        scene.draw_ellipses(axes, flown.estimate[picks, uav], flown.sigma[picks, uav], k, uav_colour(uav))
         axes.plot(*flown.estimate[:, uav, :2].T, color=uav_colour(uav), linewidth=0.5, zorder=3)
         axes.plot(*flown.position[:, uav, :2].T, color=BLACK, linewidth=1.2, zorder=4)
     page.text(left, height - 0.02, flight_title(problem, flown), va="top")
     handles: list[Any] = [
         Line2D([], [], color=BLACK, linewidth=1.2, label="true path"),
         Line2D([], [], color=GREY, linewidth=0.5, label="estimate"),
-        _ellipse_mark(k),
-    ]
-    if seen:
+        Line2D([], [], linestyle="", marker="o", markersize=6, mfc="#DDDDDD", mec=GREY, mew=0.5,
+               label=f"{k:.3g}{scene.SIGMA} of the estimate, every {ELLIPSE_EVERY_S:.0f} s"),
+    ]  # fmt: skip
+    if inflates:
         handles.append(scene.inflated_mark(k))
-    page.legend(handles, height - 0.02, x=left + 1.3)
+    page.legend(handles, height - 0.02, x=left + 1.1)
     return page.figure
 
 
-def _ellipse_mark(k: float) -> Line2D:
-    words = f"{k:.3g}\N{NO-BREAK SPACE}σ of the estimate, every {ELLIPSE_EVERY_S:.0f} s"
-    return Line2D([], [], linestyle="", marker="o", markersize=6, mfc="#DDDDDD", mec=GREY, mew=0.5, label=words)
+def _every(time_s: Array, period_s: float) -> NDArray[np.int64]:
+    """Indices of the first sample of each period."""
+    _, first = np.unique(np.floor((time_s - time_s[0]) / period_s + 1e-9), return_index=True)
+    return np.asarray(first, dtype=np.int64)
 
 
 def _closest_uavs(flown: Track, obstacles: ObstacleSet) -> list[int]:

@@ -9,9 +9,10 @@ from itertools import pairwise
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Ellipse, Patch, PathPatch
 from matplotlib.path import Path as Outline
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.formation import PathFrame
 from napf_mpc.plot.style import BLACK, GREY, PALE, RULE
+from napf_mpc.world.distance import PRISM
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 
@@ -26,6 +28,10 @@ Array = NDArray[np.float64]
 
 HEIGHT_SHADES = Normalize(0.0, 150.0)
 """Heights over which the grey of buildings darkens [m]."""
+SIGMA = "\N{NO-BREAK SPACE}\N{GREEK SMALL LETTER SIGMA}"
+"""Goes after a number of sigmas."""
+DASHES = (0.0, (3.0, 1.5))
+"""Line style of inflated obstacles."""
 INFLATED_COLOUR = "#8A6D00"
 """Dashed outline of inflated obstacles: dark, and no UAV's colour."""
 
@@ -109,43 +115,38 @@ def _outline(rings: Sequence[Array]) -> Outline:
     return Outline(vertices, codes)
 
 
-def draw_plan(axes: Axes, obstacles: ObstacleSet, view: View) -> bool:
-    """Draw the obstacles in view from above; buildings darken with height.
+def shades_heights(obstacles: ObstacleSet) -> bool:
+    """Whether greys stand for heights: in scenes with buildings."""
+    return bool((obstacles.solids.kind == PRISM).any())
 
-    Returns
-    -------
-    bool
-        Whether greys stand for heights.
-    """
+
+def height_colours() -> ListedColormap:
+    """Greys of buildings, from low to high."""
+    return ListedColormap(colormaps["Greys"](np.linspace(0.08, 0.63, 128)))
+
+
+def draw_plan(axes: Axes, obstacles: ObstacleSet, view: View) -> None:
+    """Draw the obstacles in view from above; in scenes with buildings, the taller the darker."""
     if len(obstacles) == 0:
-        return False
-    shown = np.flatnonzero(view.shows(*obstacles.boxes)).tolist()
+        return
+    lower, upper = obstacles.boxes
+    shown = np.flatnonzero(view.shows(lower, upper))
     shapes = obstacles.shapes()
-    picked = [shapes[i] for i in shown]
-    by_height = any(isinstance(shape, Prism) for shape in picked)
-    patches = [plan_outline(shape) for shape in picked]
-    collection = PatchCollection(patches, linewidths=0.4 if by_height else 0.6, edgecolors=RULE, zorder=1.0)
+    by_height = shades_heights(obstacles)
+    collection = PatchCollection(
+        [plan_outline(shapes[i]) for i in shown.tolist()],
+        linewidths=0.4 if by_height else 0.6,
+        edgecolors=RULE,
+        facecolors=PALE,
+        zorder=1.0,
+    )
     if by_height:
-        tops = np.array([shape.centre_m[2] if isinstance(shape, Sphere) else _top(shape) for shape in picked])
-        collection.set_facecolor(building_colours(tops))
-    else:
-        collection.set_facecolor(PALE)
+        collection.set(array=np.minimum(upper[shown, 2], 1e6), cmap=height_colours(), norm=HEIGHT_SHADES)
     axes.add_collection(collection, autolim=False)
-    return by_height
-
-
-def _top(shape: Box | Cylinder | Prism) -> float:
-    top = shape.centre_m[2] + 0.5 * shape.size_m[2] if isinstance(shape, Box) else shape.top_m
-    return min(top, HEIGHT_SHADES.vmax or 0.0)
-
-
-def building_colours(tops_m: Array) -> Array:
-    """Greys (n, 4) of buildings by the height of their roofs: the taller, the darker."""
-    return np.asarray(colormaps["Greys"](0.08 + 0.55 * np.clip(HEIGHT_SHADES(tops_m), 0.0, 1.0)))
 
 
 def draw_side(axes: Axes, obstacles: ObstacleSet, frame: PathFrame, view: View) -> None:
-    """Draw the obstacles in view from the side: along the path against height. Those without end fill the height."""
+    """Draw the obstacles in view from the side, along the path against height; those without end fill it."""
     if len(obstacles) == 0:
         return
     lower, upper = obstacles.boxes
@@ -181,29 +182,17 @@ def _ground_corners(shape: Box | Cylinder | Prism, height_m: float) -> Array:
 
 def draw_inflated(
     axes: Axes, shape: Shape, margin_m: float, height_m: float, colour: str = INFLATED_COLOUR
-) -> Patch | None:
+) -> Artist:
     """Draw an obstacle inflated by a margin from above, dashed.
 
     A sphere or cylinder becomes a circle of radius + margin. Any other shape is drawn as the line on which
     the library's own distance at a height equals the margin.
-
-    Returns
-    -------
-    Patch or None
-        The circle, or None where a line was drawn.
     """
     if isinstance(shape, (Sphere, Cylinder)):
-        circle = Circle(
-            shape.centre_m[:2],
-            shape.radius_m + margin_m,
-            facecolor="none",
-            edgecolor=colour,
-            linewidth=0.7,
-            linestyle=(0, (3, 1.5)),
-            zorder=1.5,
-        )
-        axes.add_patch(circle)
-        return circle
+        radius = shape.radius_m + margin_m
+        circle = Circle(shape.centre_m[:2], radius, fill=False, edgecolor=colour, linewidth=0.7, linestyle=DASHES)
+        circle.set_zorder(1.5)
+        return axes.add_patch(circle)
     alone = ObstacleSet.from_shapes([shape])
     lower, upper = alone.boxes
     reach = 1.05 * margin_m + 0.5
@@ -211,11 +200,11 @@ def draw_inflated(
     y = np.linspace(lower[0, 1] - reach, upper[0, 1] + reach, 121)
     grid = np.stack([*np.meshgrid(x, y), np.full((121, 121), height_m)], axis=-1)
     distance = alone.signed_distance(grid.reshape(1, -1, 3)).reshape(121, 121)
-    if distance.min() < margin_m < distance.max():
-        axes.contour(
-            x, y, distance, levels=[margin_m], colors=colour, linewidths=0.7, linestyles=[(0, (3, 1.5))], zorder=1.5
-        )
-    return None
+    # Far above a low roof there is no such line; contour would warn.
+    level = max(margin_m, float(distance.min()))
+    return axes.contour(
+        x, y, distance, levels=[level], colors=colour, linewidths=0.7, linestyles=[DASHES], zorder=1.5
+    )
 
 
 def draw_ellipses(
@@ -266,13 +255,13 @@ def end_mark() -> Line2D:
 
 def contact_mark() -> Line2D:
     """Legend entry for a contact."""
-    return Line2D([], [], linestyle="", marker="X", markersize=6, mfc=BLACK, mec="white", mew=0.5, label="contact")
+    return Line2D([], [], label="contact", linestyle="", marker="X", markersize=6, mfc=BLACK, mec="white", mew=0.5)
 
 
 def inflated_mark(k: float) -> Line2D:
     """Legend entry for inflated obstacles."""
-    words = f"obstacle + {k:.3g}\N{NO-BREAK SPACE}σ"
-    return Line2D([], [], color=INFLATED_COLOUR, linewidth=0.7, linestyle=(0, (3, 1.5)), label=words)
+    words = f"obstacle + {k:.3g}{SIGMA}"
+    return Line2D([], [], color=INFLATED_COLOUR, linewidth=0.7, linestyle=DASHES, label=words)
 
 
 def obstacle_mark() -> Patch:

@@ -19,6 +19,8 @@ from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 
 Array = NDArray[np.float64]
 
+ELEVATION_DEG, AZIMUTH_DEG = 24.0, -68.0
+"""Direction from which the scene is seen."""
 MOST_SOLIDS = 250
 """Solids drawn at most, those nearest to the paths; more only hide each other."""
 
@@ -41,9 +43,15 @@ def space_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figu
         shown = [shapes[i] for i in inside.tolist()]
         ends = [float(value) for value in (*lower[inside, 2], *upper[inside, 2]) if math.isfinite(value)]
         low, high = min([low, *ends]), max([high, *ends])
-    page = Page.of_size(PAGE_IN, 3.5, credit_of(problem))
+    sides = (view.width, view.height, high - low)
+    wide, tall = _seen_size(sides)
+    scale = min((PAGE_IN - 1.5) / wide, 4.0 / tall)
+    height = scale * tall + 1.15
+    page = Page.of_size(PAGE_IN, height, credit_of(problem))
     # mplot3d has no type information.
-    axes = cast(Any, page.axes(0.0, 0.0, PAGE_IN, 3.3, projection="3d", computed_zorder=False))
+    # Its axes are square and clip to the square: as wide as the page, they reach beyond its edges.
+    low_edge = 0.5 * (height - 0.2 - PAGE_IN)
+    axes = cast(Any, page.axes(0.0, low_edge, PAGE_IN, PAGE_IN, projection="3d", computed_zorder=False))
     for shape in shown:
         _draw_solid(axes, shape, low, high)
     for uav in range(flown.uavs):
@@ -51,11 +59,12 @@ def space_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figu
         x, y, z = flown.position[:, uav].T
         axes.plot(x, y, z, color=colour, linewidth=1.1, zorder=5)
         axes.plot(x, y, np.full_like(z, low), color=colour, linewidth=0.4, alpha=0.6, zorder=0.5)
-        axes.plot(x[:1], y[:1], z[:1], "o", markersize=3.5, mfc="white", mec=colour, zorder=6)
-        axes.plot(x[-1:], y[-1:], z[-1:], "s", markersize=3.2, color=colour, zorder=6)
+        mark = {"s": 13, "edgecolor": colour, "linewidth": 0.9, "depthshade": False, "zorder": 6}
+        axes.scatter(x[:1], y[:1], z[:1], marker="o", facecolor="white", **mark)
+        axes.scatter(x[-1:], y[-1:], z[-1:], marker="s", facecolor=colour, **mark)
     axes.set(xlim=view.x, ylim=view.y, zlim=(low, high))
-    axes.set_box_aspect((view.width, view.height, high - low), zoom=1.25)
-    axes.view_init(elev=24.0, azim=-68.0)
+    axes.set_box_aspect(sides, zoom=scale / PAGE_IN)
+    axes.view_init(elev=ELEVATION_DEG, azim=AZIMUTH_DEG)
     axes.locator_params(axis="y", nbins=4)
     axes.locator_params(axis="z", nbins=4)
     axes.set_xlabel("East x (m)", labelpad=12.0)
@@ -65,9 +74,21 @@ def space_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figu
     for pane in (axes.xaxis, axes.yaxis, axes.zaxis):
         pane.set_pane_color((1.0, 1.0, 1.0, 0.0))
         pane._axinfo["grid"].update(color="#E4E4E4", linewidth=0.4)
-    page.text(0.1, 3.48, planner_name(flown.planner), va="top")
-    page.legend(uav_handles(flown.uavs), 3.48)
+    page.text(0.1, height - 0.02, planner_name(flown.planner), va="top")
+    page.legend(uav_handles(flown.uavs), height - 0.02)
     return page.figure
+
+
+def _seen_size(sides: tuple[float, float, float]) -> tuple[float, float]:
+    """Width and height of a box of this shape as seen, in units of the side of square axes without zoom."""
+    axes = cast(Any, Figure(figsize=(1.0, 1.0)).add_axes((0.0, 0.0, 1.0, 1.0), projection="3d"))
+    axes.set_box_aspect(sides, zoom=1.0)
+    axes.view_init(elev=ELEVATION_DEG, azim=AZIMUTH_DEG)
+    axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), zlim=(0.0, 1.0))
+    corners = np.array([[*pick, 1.0] for pick in np.ndindex(2, 2, 2)])
+    seen = corners @ np.asarray(axes.get_proj()).T
+    place = axes.transData.transform(seen[:, :2] / seen[:, 3:]) / axes.get_figure().dpi
+    return float(np.ptp(place[:, 0])), float(np.ptp(place[:, 1]))
 
 
 def _draw_solid(axes: Any, shape: Shape, low: float, high: float) -> None:
@@ -77,7 +98,7 @@ def _draw_solid(axes: Any, shape: Shape, low: float, high: float) -> None:
         x = shape.centre_m[0] + shape.radius_m * around * np.cos(turn)
         y = shape.centre_m[1] + shape.radius_m * around * np.sin(turn)
         z = shape.centre_m[2] + shape.radius_m * np.cos(polar)
-        axes.plot_surface(x, y, z, color=PALE, alpha=0.75, linewidth=0.0, zorder=2, rcount=13, ccount=21)
+        axes.plot_surface(x, y, z, color=PALE, alpha=0.75, linewidth=0.0, zorder=2, rcount=13, ccount=21, rasterized=True)
         return
     if isinstance(shape, Box):
         base, top = shape.centre_m[2] - 0.5 * shape.size_m[2], shape.centre_m[2] + 0.5 * shape.size_m[2]
@@ -88,7 +109,7 @@ def _draw_solid(axes: Any, shape: Shape, low: float, high: float) -> None:
         walls = np.stack([np.full(len(closed), base), np.full(len(closed), top)])
         x, y = np.broadcast_to(closed.T[:, None], (2, 2, len(closed)))
         axes.plot_surface(
-            x, y, walls, color=PALE, alpha=0.35, linewidth=0.0, zorder=2, rcount=2, ccount=len(closed)
+            x, y, walls, color=PALE, alpha=0.35, linewidth=0.0, zorder=2, rcount=2, ccount=len(closed), rasterized=True
         )
         axes.plot(closed[:, 0], closed[:, 1], np.full(len(closed), top), color="#6E6E6E", linewidth=0.4, zorder=3)
 

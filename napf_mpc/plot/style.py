@@ -164,6 +164,6 @@ def save(figure: Figure, out: Path, stem: str) -> list[Path]:
     png, svg = folder / f"{stem}.png", folder / f"{stem}.svg"
     write_bytes(png, lambda file: figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None}))
     write_bytes(
-        svg, lambda file: figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+        svg, lambda file: figure.savefig(file, format="svg", dpi=DPI, metadata={"Date": None, "Creator": None})
     )
     return [png, svg]

@@ -44,7 +44,7 @@ class Track:
     @property
     def uavs(self) -> int:
         """Number of UAVs."""
-        return self.position.shape[1]
+        return int(self.position.shape[1])
 
 
 def track(trajectories: Mapping[str, NDArray[Any]], planner: str, run: int) -> Track:
@@ -69,7 +69,9 @@ def track(trajectories: Mapping[str, NDArray[Any]], planner: str, run: int) -> T
     rows = np.flatnonzero((trajectories["planner"] == planner) & (trajectories["run"] == run))
     if len(rows) == 0:
         known = sorted({str(name) for name in trajectories["planner"]})
-        raise DataError(f'trajectories: no row of planner "{planner}" in run {run}; planners: {", ".join(known)}')
+        raise DataError(
+            f'trajectories: no row of planner "{planner}" in run {run}; planners: {", ".join(known)}'
+        )
     uav = np.asarray(trajectories["uav"][rows], dtype=np.int64)
     rows = rows[np.lexsort((uav, trajectories["t_s"][rows]))]
     uavs = int(uav.max()) + 1
@@ -107,21 +109,23 @@ def inflation_of(problem: Problem, planner: str) -> Inflation:
 
 
 @dataclass(frozen=True)
-class Encounter:
-    """How a UAV saw an obstacle when it believed itself closest to it."""
+class Acting:
+    """Obstacles while they act on a UAV, as the planner saw it; one entry an obstacle, UAV and time."""
 
-    obstacle: int
-    """Index of the obstacle in its scene."""
-    uav: int
-    """Which UAV."""
-    sample: int
-    """Index into the track's times."""
-    margin_m: float
-    """k sigma by which the obstacle was inflated [m]."""
+    sample: NDArray[np.int64]
+    """(n,) index into the track's times."""
+    uav: NDArray[np.int64]
+    """(n,) which UAV."""
+    obstacle: NDArray[np.int64]
+    """(n,) index of the obstacle in its scene."""
+    rho_m: Array
+    """(n,) distance from the UAV's hull to the inflated obstacle; below zero inside it [m]."""
+    margin_m: Array
+    """(n,) k sigma by which the obstacle was inflated [m]."""
 
 
-def encounters(problem: Problem, flown: Track, obstacles: ObstacleSet, each_uav: bool = False) -> list[Encounter]:
-    """Obstacles that acted on a UAV, each at the moment of the closest approach as the planner saw it.
+def acting(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Acting:
+    """Find every obstacle within the range of influence of a UAV, as the planner saw it.
 
     The planner sees the estimate and the reported sigma. Trajectories hold the sigma of each axis and no
     covariance between axes, so the margin along an oblique direction leaves that covariance out.
@@ -134,19 +138,15 @@ def encounters(problem: Problem, flown: Track, obstacles: ObstacleSet, each_uav:
         The flight.
     obstacles : ObstacleSet
         One scene.
-    each_uav : bool
-        One encounter for each UAV and obstacle, else only that of the UAV that came closest.
 
     Returns
     -------
-    list of Encounter
-        By obstacle, then UAV.
+    Acting
+        By time, then UAV, then distance to the obstacle.
     """
     inflation = inflation_of(problem, flown.planner)
     usable = (np.isfinite(flown.estimate) & np.isfinite(flown.sigma)).all(-1).ravel()
     picks = np.flatnonzero(usable)
-    if len(picks) == 0 or len(obstacles) == 0:
-        return []
     points = flown.estimate.reshape(-1, 3)[picks]
     covariance = diagonal(flown.sigma.reshape(-1, 3)[picks] ** 2)
     reach = problem.planner.influence_m + problem.vehicle.radius_m + inflation.largest_margin(covariance)
@@ -154,14 +154,31 @@ def encounters(problem: Problem, flown: Track, obstacles: ObstacleSet, each_uav:
     margin = inflation.margin(covariance, near.gradient[0])
     rho = near.distance[0] - problem.vehicle.radius_m - margin
     row, slot = np.nonzero(rho < problem.planner.influence_m)
-    best: dict[tuple[int, int], tuple[float, Encounter]] = {}
-    for i, j in zip(row.tolist(), slot.tolist(), strict=True):
-        sample, uav = divmod(int(picks[i]), flown.uavs)
-        obstacle = int(near.index[0, i, j])
-        key = (obstacle, uav if each_uav else -1)
-        if key not in best or rho[i, j] < best[key][0]:
-            best[key] = (float(rho[i, j]), Encounter(obstacle, uav, sample, float(margin[i, j])))
-    return [best[key][1] for key in sorted(best)]
+    sample, uav = np.divmod(picks[row], flown.uavs)
+    return Acting(sample, uav, near.index[0][row, slot], rho[row, slot], margin[row, slot])
+
+
+def encounters(seen: Acting, uav: int, most: int) -> list[int]:
+    """Entries at which a UAV believed itself closest to each obstacle, the obstacles that came closest first.
+
+    Parameters
+    ----------
+    seen : Acting
+        As :func:`acting` returns it.
+    uav : int
+        Which UAV.
+    most : int
+        Keep this many obstacles.
+
+    Returns
+    -------
+    list of int
+        Indices into ``seen``, one an obstacle.
+    """
+    mine = np.flatnonzero(seen.uav == uav)
+    mine = mine[np.argsort(seen.rho_m[mine], kind="stable")]
+    _, first = np.unique(seen.obstacle[mine], return_index=True)
+    return [int(entry) for entry in mine[np.sort(first)][:most]]
 
 
 @dataclass(frozen=True)
@@ -179,13 +196,13 @@ class Contact:
 
 
 def clearances(flown: Track, obstacles: ObstacleSet, radius_m: float) -> Array:
-    """Clearance (time, uav) between each UAV's hull and the nearest obstacle, on the truth; +inf without any [m]."""
+    """Clearance (time, uav) of each UAV's hull from the nearest obstacle, on the truth; +inf without any [m]."""
     distance = obstacles.signed_distance(flown.position.reshape(1, -1, 3))
     return distance.reshape(flown.position.shape[:2]) - radius_m
 
 
 def separations(flown: Track) -> Array:
-    """Distance (time, uav) between the centres of each UAV and its nearest neighbour; +inf for a lone one [m]."""
+    """Distance (time, uav) of each UAV's centre from that of its nearest neighbour; +inf for a lone one [m]."""
     out = np.full(flown.position.shape[:2], np.inf)
     for i in range(flown.uavs):
         gaps = np.sqrt(((flown.position - flown.position[:, i : i + 1]) ** 2).sum(-1))

@@ -54,9 +54,9 @@ class TrackingLaw:
 
         With ``d = X - P``, chi holds the cross-track error ``e_p = (I3 - n n^T) d`` (Eq. 14 as read; all of d
         where n is zero), the velocity error ``e_v = X' - V_ref``, attitude and rates. Both errors are clamped
-        by their norm, which keeps their direction: the LQR is linear, and on the nonlinear vehicle an error
-        of ten metres or an 8 m/s jump would command a tilt from which it tumbles. Their horizontal parts are
-        turned into the frame of ``ref_yaw``, where the gain, derived at yaw zero, holds; the yaw error is
+        by their norm, which keeps their direction: the LQR is linear, and on the nonlinear vehicle jumps of
+        15 m and 8 m/s, if shown whole, command tilts from which it tumbles. Their horizontal parts are turned
+        into the frame of ``ref_yaw``, where the gain, derived at yaw zero, holds; the yaw error is
         wrapped to (-pi, pi].
 
         Each rotor's thrust is clipped alone to [0, limit], as a motor does: a saturated rotor changes thrust

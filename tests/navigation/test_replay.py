@@ -48,7 +48,7 @@ def test_each_sample_is_held_and_the_log_wraps():
     np.testing.assert_array_equal(errors.fix(5).covariance[0, 0], staircase().covariance[2])
 
 
-@pytest.mark.parametrize("rate_hz", [10.0, 3.0, 50.0, 7.0])
+@pytest.mark.parametrize("rate_hz", [10.0, 3.0, 50.0, 49.0])
 def test_samples_change_on_the_second_at_any_rate(rate_hz: float):
     errors = flown(config(rate_hz=rate_hz), staircase(), [0.0], [[0.0]], round(9 * rate_hz) + 1)
     for second in range(1, 10):
@@ -110,6 +110,16 @@ def test_gaps_are_replayed_as_outages():
     assert epochs_of(errors, 1, 6) == [6, 6, 6, 6, 0, 0]
     np.testing.assert_allclose(
         fix.covariance[0, 1], log.covariance[6] + (COAST_SIGMA_MPS * 2.0) ** 2 * np.eye(3)
+    )
+
+
+def test_a_log_that_starts_in_a_gap_carries_on_from_its_end():
+    log = staircase([0, 0, 1, 1, 1, 1, 1, 1, 1, 1])
+    errors = flown(config(rate_hz=1.0, gaps="outage"), log, [0.0], [[0.1]], 3)
+    assert epochs_of(errors, 0, 3) == [9, 2, 3]
+    fix = errors.fix(0)  # sample 1, two seconds after the log's last
+    np.testing.assert_allclose(
+        fix.covariance[0, 0] - log.covariance[9], (COAST_SIGMA_MPS * 2.0) ** 2 * np.eye(3)
     )
 
 

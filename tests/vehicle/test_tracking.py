@@ -264,6 +264,12 @@ def test_what_is_not_finite_is_never_turned_into_a_command(name, bad):
     assert (got[1, 1] == sound[1, 1]).all()
 
 
+@pytest.mark.parametrize("name", ["position", "velocity"])
+def test_an_error_too_large_to_measure_is_no_small_one(name):
+    """Its norm overflows: the clamp must not scale it to nothing."""
+    assert not np.isfinite(commanded(**{name: (1e200, 0.0, 0.0)})).any()
+
+
 @pytest.mark.parametrize("name", list(nav_batch(1, 1)))
 def test_shapes_that_do_not_fit_are_refused_by_name(name):
     batch = nav_batch(2, 3)

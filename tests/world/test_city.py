@@ -94,7 +94,10 @@ def cube_town():
             "part": {
                 "type": "BuildingPart",
                 "parents": ["whole"],
-                "geometry": [{"type": "MultiSurface", "lod": 1, "boundaries": [[face] for face in box]}],
+                "geometry": [
+                    {"type": "MultiSurface", "lod": "2.1", "boundaries": [[[0, 1, 2]], [[8, 9, 10]]]},
+                    {"type": "MultiSurface", "lod": 1, "boundaries": [[face] for face in box]},
+                ],
             },
             "street": {
                 "type": "Road",
@@ -249,6 +252,14 @@ def test_blocks_are_recovered_from_their_faces(tmp_path):
     assert footprint(part).symmetric_difference(shapely.box(20, -10, 30, 0)).area < 1e-6
 
 
+def test_a_roof_may_be_one_face_with_a_hole(tmp_path):
+    town = cube_town()
+    court(town).update(type="MultiSurface", boundaries=[[[8, 9, 10, 11], [12, 13, 14, 15]], [[0, 1, 9, 8]]])
+    prism = read_cityjson(write(tmp_path, town, "town.json")).prisms[0]
+    assert len(prism.rings) == 2
+    assert footprint(prism).area == pytest.approx(500.0)
+
+
 def test_origin_in_the_files_coordinates(tmp_path):
     path = write(tmp_path, cube_town(), "town.json")
     moved = read_cityjson(path, origin_m=(84000.0, 447000.0, 0.0), min_height_m=10.0)
@@ -329,18 +340,12 @@ READERS = pytest.mark.parametrize(
 @READERS
 def test_text_that_is_no_city_is_a_data_error(tmp_path, read, make):
     whole = json.dumps(make())
-    for text in (
-        "",
-        "{",
-        "[]",
-        "null",
-        "3",
-        whole[:-20],
-        whole.replace("12.5", "NaN", 1) + "x",
-        "[" * 100_000,
-    ):
+    for text in ("", "{", "[]", "null", "3", whole[:-20], "[" * 100_000, '{"id": 1' + "0" * 5000 + "}"):
         with pytest.raises(DataError, match="town"):
             read(write(tmp_path, text))
+    for word in ("NaN", "Infinity", "-Infinity"):
+        with pytest.raises(DataError, match=f"is not JSON: {word} is not a number"):
+            read(write(tmp_path, whole[:-1] + f', "note": {word}}}'))
     (tmp_path / "town.geojson").write_bytes(b"\xff\xfe\x00{}")
     with pytest.raises(DataError, match="is not JSON"):
         read(tmp_path / "town.geojson")

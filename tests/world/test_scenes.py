@@ -199,6 +199,14 @@ def test_placement_agrees_with_a_plain_loop(count, length, width, radius, gap, c
         assert not rules.surely_too_many()
 
 
+def test_area_bound_lets_the_densest_packing_pass():
+    # Hexagonal rows of 20 discs of diameter 1 m: tighter than a square grid, and possible.
+    row = math.sqrt(3.0) / 2.0
+    rules = ApartRules(400, (0.0, 19.5), (0.0, 19 * row), (0.0, 0.0), (0.5, 0.5), 0.0)
+    assert not rules.surely_too_many()
+    assert ApartRules(500, (0.0, 19.5), (0.0, 19 * row), (0.0, 0.0), (0.5, 0.5), 0.0).surely_too_many()
+
+
 def test_impossible_scatter_says_what_to_change():
     for count in (60, 100_000):
         crowded = Scatter(kind="scatter", count=count, along_range_m=(0.0, 20.0), lateral_range_m=(0.0, 20.0))

@@ -1,0 +1,233 @@
+"""Figures of a comparison of planners: collision risk, what it costs, and how close it was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import PercentFormatter
+from numpy.typing import NDArray
+
+from napf_mpc.plot.style import (
+    BLACK,
+    COLUMN_IN,
+    GREY,
+    PAGE_IN,
+    Page,
+    house_style,
+    planner_colour,
+    planner_name,
+    save,
+)
+from napf_mpc.problem import Reference
+from napf_mpc.risk import Rate, wilson
+
+TRADES = (("shape_rms_m", "Shape RMS (m)"), ("path_rms_m", "Path RMS (m)"))
+"""Metrics that are set against the risk."""
+NEAR_M = 3.0
+"""Clearance up to which the distribution is drawn [m]."""
+
+
+def compare_figures(
+    summary: Mapping[str, Any],
+    rows: Mapping[str, NDArray[Any]],
+    out: Path,
+    reference: Reference | None = None,
+    credit: str = "",
+) -> list[Path]:
+    """Make the three figures of a comparison, PNG and SVG.
+
+    Parameters
+    ----------
+    summary : mapping
+        As :func:`napf_mpc.campaign.run_campaign` returns it.
+    rows : mapping of str to array
+        Columns of ``runs.parquet``.
+    out : Path
+        Output folder.
+    reference : Reference, optional
+        Published figures to show beside ours.
+    credit : str
+        Source and licence of shared data, printed below each figure.
+
+    Returns
+    -------
+    list of Path
+        ``compare_risk``, ``compare_trade`` and ``compare_clearance``.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written.
+    """
+    with house_style():
+        figures = {
+            "compare_risk": risk_figure(summary, reference, credit),
+            "compare_trade": trade_figure(summary, credit),
+            "compare_clearance": clearance_figure(summary, rows, credit),
+        }
+        return [path for stem, figure in figures.items() for path in save(figure, out, stem)]
+
+
+def published(reference: Reference) -> dict[str, Rate]:
+    """Published collision risks with the 95 % Wilson intervals of their number of runs."""
+    return {
+        name: wilson(round(risk * reference.runs), reference.runs)
+        for name, risk in reference.collision_risk.items()
+    }
+
+
+def risk_figure(summary: Mapping[str, Any], reference: Reference | None = None, credit: str = "") -> Figure:
+    """Collision risk of each planner with its 95 % interval, and the published one below it with its own."""
+    planners: Mapping[str, Any] = summary["planners"]
+    theirs = published(reference) if reference is not None else {}
+    lines: list[tuple[str, str, float, float, float, bool]] = []
+    for name, part in planners.items():
+        risk = (part["collision_risk"], part["collision_risk_low"], part["collision_risk_high"])
+        lines.append((name, f"{planner_name(name)}, N = {part['runs']:,}".replace(",", " "), *risk, True))
+        if name in theirs:
+            paper = theirs[name]
+            label = f"{planner_name(name)}, published, N = {paper.total}"
+            lines.append((name, label, paper.value, paper.low, paper.high, False))
+    row, bottom, top, left = 0.25, 0.42, 0.08, 1.75 if theirs else 1.15
+    page = Page.of_size(COLUMN_IN, bottom + row * len(lines) + top, credit)
+    axes = page.axes(left, bottom, COLUMN_IN - left - 0.18, row * len(lines))
+    for place, (name, _, value, low, high, ours) in enumerate(lines):
+        height = len(lines) - 1 - place
+        axes.errorbar(
+            value,
+            height,
+            xerr=[[max(0.0, value - low)], [max(0.0, high - value)]],
+            fmt="o",
+            markersize=4.5,
+            color=planner_colour(name),
+            mfc=planner_colour(name) if ours else "white",
+            capsize=2.5,
+            elinewidth=1.0,
+            clip_on=False,
+            zorder=3,
+        )
+    axes.set_yticks(range(len(lines)), [line[1] for line in reversed(lines)])
+    axes.set(ylim=(-0.6, len(lines) - 0.4), xlim=(0.0, _round_up(max(line[4] for line in lines))))
+    axes.set_xlabel("Runs with an obstacle contact (%),\n95 % interval" if False else "Collision risk (%), 95 % interval")
+    axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
+    axes.tick_params(axis="y", length=0.0)
+    axes.spines["left"].set_visible(False)
+    axes.grid(axis="x", color="#E4E4E4", linewidth=0.5)
+    axes.set_axisbelow(True)
+    return page.figure
+
+
+def _round_up(share: float) -> float:
+    for limit in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0):
+        if share <= limit:
+            return limit
+    return 1.0
+
+
+def trade_figure(summary: Mapping[str, Any], credit: str = "") -> Figure:
+    """Risk against formation error: median, 5th to 95th percentile and 95 % interval of the risk; the floor is marked.
+
+    The floor is the shape error that the navigation errors alone would cause if every UAV sat on its
+    estimate's slot.
+    """
+    planners: Mapping[str, Any] = summary["planners"]
+    left, gap, bottom, tall, top = 0.5, 0.25, 0.4, 2.0, 0.28
+    wide = (PAGE_IN - left - gap - 0.1) / 2
+    page = Page.of_size(PAGE_IN, bottom + tall + top, credit)
+    highest = _round_up(max(part["collision_risk_high"] for part in planners.values()))
+    for place, (metric, words) in enumerate(TRADES):
+        axes = page.axes(left + place * (wide + gap), bottom, wide, tall)
+        reach = 0.0
+        for name, part in planners.items():
+            spread = part[metric]
+            if spread["median"] is None:
+                continue
+            axes.errorbar(
+                spread["median"],
+                part["collision_risk"],
+                xerr=[[spread["median"] - spread["p05"]], [spread["p95"] - spread["median"]]],
+                yerr=[
+                    [max(0.0, part["collision_risk"] - part["collision_risk_low"])],
+                    [max(0.0, part["collision_risk_high"] - part["collision_risk"])],
+                ],
+                fmt="o",
+                markersize=5,
+                capsize=2.5,
+                elinewidth=1.0,
+                color=planner_colour(name),
+                zorder=3,
+                clip_on=False,
+            )
+            reach = max(reach, spread["p95"])
+        floors = [part["shape_floor_m"]["median"] for part in planners.values()]
+        known = [floor for floor in floors if floor is not None]
+        if metric == "shape_rms_m" and known:
+            floor = float(np.median(known))
+            axes.axvline(floor, color=GREY, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1)
+            axes.annotate(
+                "floor", (floor, 1.0), xycoords=("data", "axes fraction"), xytext=(-3, -2),
+                textcoords="offset points", ha="right", va="top", color=GREY,
+            )  # fmt: skip
+            reach = max(reach, floor)
+        axes.set(xlim=(0.0, 1.06 * reach or 1.0), ylim=(0.0, highest), xlabel=words)
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
+        axes.tick_params(labelleft=place == 0)
+        if place == 0:
+            axes.set_ylabel("Collision risk (%)")
+    handles = _planner_handles(planners)
+    note = "bars: 5th to 95th percentile of runs, 95 % interval of the risk"
+    page.legend([*handles, Line2D([], [], color=GREY, label=note)], bottom + tall + top - 0.02, x=left)
+    return page.figure
+
+
+def _planner_handles(planners: Mapping[str, Any]) -> list[Line2D]:
+    return [
+        Line2D([], [], color=planner_colour(name), marker="o", markersize=4.5, label=planner_name(name))
+        for name in planners
+    ]
+
+
+def clearance_figure(
+    summary: Mapping[str, Any], rows: Mapping[str, NDArray[Any]], credit: str = ""
+) -> Figure:
+    """Distribution over runs of the least clearance to an obstacle; what lies left of zero are the collisions."""
+    planners: Sequence[str] = list(summary["planners"])
+    page = Page.of_size(COLUMN_IN, 2.5, credit)
+    axes = page.axes(0.5, 0.42, COLUMN_IN - 0.5 - 0.12, 1.8)
+    lowest, highest = -0.5, 0.5
+    for name in planners:
+        values = np.asarray(rows["min_clearance_m"], dtype=float)[rows["planner"] == name]
+        x, y = ecdf(values)
+        if len(x) == 0:
+            continue
+        axes.plot(x, y, drawstyle="steps-post", color=planner_colour(name), linewidth=1.2)
+        lowest, highest = min(lowest, float(x[1])), max(highest, float(np.quantile(x[1:], 0.99)))
+    axes.axvline(0.0, color=BLACK, linewidth=0.8, linestyle=(0, (4, 2)), zorder=2)
+    axes.annotate("contact", (0.0, 1.0), xycoords=("data", "axes fraction"), xytext=(-3, 1),
+                  textcoords="offset points", ha="right", va="top", rotation=90)  # fmt: skip
+    axes.set(xlim=(1.05 * lowest, 1.02 * highest), ylim=(0.0, 1.0))
+    axes.set_xlabel("Least clearance of a run (m)")
+    axes.set_ylabel("Runs with less (%)")
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
+    page.legend(
+        [Line2D([], [], color=planner_colour(name), linewidth=1.2, label=planner_name(name)) for name in planners],
+        2.46,
+    )
+    return page.figure
+
+
+def ecdf(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Empirical distribution: sorted values after a first -inf, and the share of runs at or below each.
+
+    Runs without a value (no obstacle, failed) count in none of it.
+    """
+    known = np.sort(values[np.isfinite(values)])
+    if len(known) == 0:
+        return np.empty(0), np.empty(0)
+    return np.concatenate([[-np.inf], known]), np.linspace(0.0, 1.0, len(known) + 1)
