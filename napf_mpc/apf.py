@@ -133,11 +133,11 @@ def limit_turn(velocity: Array, path_direction: Array, left: Array, max_turn_rad
     array, shape (..., 3)
         Unit vectors.
     """
-    forward = _dot(velocity, path_direction)
+    forward = _dot(velocity, path_direction) + 0.0  # no -0.0, which arctan2 takes for straight back
     sideways = velocity - forward[..., None] * path_direction
     across = _norm(sideways)
-    speed = np.hypot(forward, across)
-    straight_back = (across <= 1e-12 * speed) & (forward < 0.0)
+    # Below that the side is rounding error, and would not be perpendicular to the path.
+    straight_back = (forward < 0.0) & (across <= -1e-9 * forward)
     side = np.where(straight_back[..., None], left, sideways / np.where(across > 0.0, across, 1.0)[..., None])
     angle = np.minimum(np.arctan2(np.where(straight_back, 0.0, across), forward), max_turn_rad)
     return np.asarray(np.cos(angle)[..., None] * path_direction + np.sin(angle)[..., None] * side)

@@ -50,33 +50,51 @@ Planners = Annotated[str, typer.Option(help="Planners, with commas.")]
 
 F = TypeVar("F", bound=Callable[..., None])
 
+_UsageError: Any = typer.BadParameter.__base__  # click's, wherever this version of typer keeps it
 
-def main() -> None:
+
+def main() -> NoReturn:
     """Run the command line and leave with its exit code: 0, 1 (not reached), 2 (bad input), 130 or 143."""
-    signal.signal(signal.SIGTERM, _terminated)
-    app()
+    interrupts.handle_signals()
+    sys.exit(run_command())
 
 
-def _terminated(signum: int, frame: object) -> NoReturn:
-    print("terminated: finished blocks are kept; repeat the command to go on", file=sys.stderr)
-    sys.exit(128 + signum)
+def run_command(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; errors are one clear line, never a traceback.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Instead of those that the process was started with.
+    """
+    try:
+        return int(app(arguments, prog_name="napf-mpc", standalone_mode=False) or 0)
+    except _UsageError as error:
+        _complain(error.format_message())
+    except NapfError as error:
+        _complain(str(error))
+    except MemoryError:
+        _complain("out of memory; finished blocks are kept: take a smaller problem, or fewer --workers")
+    return 2
+
+
+def _complain(text: str) -> None:
+    for line in text.splitlines():
+        print(f"error: {line}", file=sys.stderr)
 
 
 def _command(function: F) -> F:
-    """Register a command whose errors are one clear line and an exit code, never a traceback."""
+    """Register a command that ends with the right words and exit code when it is told to stop."""
 
     @functools.wraps(function)
-    def guarded(*args: Any, **kwargs: Any) -> None:
+    def stoppable(*args: Any, **kwargs: Any) -> None:
         try:
             function(*args, **kwargs)
-        except NapfError as error:
-            print(f"error: {error}", file=sys.stderr)
-            raise typer.Exit(2) from None
-        except KeyboardInterrupt:
-            print("interrupted: finished blocks are kept; repeat the command to go on", file=sys.stderr)
-            raise typer.Exit(130) from None
+        except KeyboardInterrupt as stop:  # caught before typer, to which every stop is Ctrl-C
+            interrupts.say_stopped()
+            raise typer.Exit(getattr(stop, "exit_code", 130)) from None
 
-    app.command()(guarded)
+    app.command()(stoppable)
     return function
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +11,36 @@ from numpy.typing import NDArray
 
 from napf_mpc import store
 from napf_mpc.errors import DataError
+from napf_mpc.formation import PathFrame, formation_offsets
+from napf_mpc.goal_walk import goal_scenes
+from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.simulate import initial_state
 from napf_mpc.world.obstacles import ObstacleSet
+from napf_mpc.world.scenes import build_scenes
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 
 Array = NDArray[np.float64]
 
-MAX_SCENES = 10_000
-"""Scenes written to a file; any further run's scene follows from the seed."""
+MAX_OBSTACLES = 400_000
+"""Obstacles written to a file, about 40 MB; the scene of any further run follows from the seed."""
 _BATCH = 256
+
+
+def scenes_of(
+    problem: Problem, seed: int = 0, runs: range = range(1), data_folder: Path | None = None
+) -> ObstacleSet:
+    """Obstacles of some runs of a campaign, for either kind of mission: one scene a run, or one for all.
+
+    Raises
+    ------
+    NapfError
+        If a scene cannot be built, or data are missing.
+    """
+    mission = problem.mission
+    if not isinstance(mission, FormationMission):
+        return goal_scenes(problem, seed, runs, data_folder)
+    lanes = formation_offsets(problem.formation)[:, 1]
+    return build_scenes(problem.world, PathFrame.of_mission(mission), lanes, seed, runs, data_folder)
 
 
 def shape_to_json(shape: Shape) -> dict[str, Any]:
@@ -28,12 +49,8 @@ def shape_to_json(shape: Shape) -> dict[str, Any]:
         case Sphere():
             return {"shape": "sphere", "centre_m": list(shape.centre_m), "radius_m": shape.radius_m}
         case Cylinder():
-            out: dict[str, Any] = {
-                "shape": "cylinder",
-                "centre_m": list(shape.centre_m),
-                "radius_m": shape.radius_m,
-            }
-            return out | _ends(shape.base_m, shape.top_m)
+            cylinder = {"shape": "cylinder", "centre_m": list(shape.centre_m), "radius_m": shape.radius_m}
+            return cylinder | _ends(shape.base_m, shape.top_m)
         case Box():
             box = {"shape": "box", "centre_m": list(shape.centre_m), "size_m": list(shape.size_m)}
             return box | {"heading_deg": math.degrees(shape.heading_rad)}
@@ -74,51 +91,64 @@ def shape_from_json(table: dict[str, Any]) -> Shape:
 
 
 def write_scenario(
-    path: Path,
-    problem: dict[str, Any],
-    seed: int,
-    runs: range,
-    initial_state: Array,
-    obstacles_of: Callable[[range], ObstacleSet],
+    path: Path, problem: Problem, seed: int, runs: range, data_folder: Path | None = None
 ) -> None:
-    """Write problem, seed, initial state and the obstacles of every run (the first 10,000).
+    """Write problem, seed, initial state and the obstacles of every run, up to 400,000 obstacles.
 
     Parameters
     ----------
     path : Path
         File to write.
-    problem : dict
-        The resolved problem as plain data.
+    problem : Problem
+        What is flown; the file holds it with every default filled in.
     seed : int
         Campaign seed.
     runs : range
         Indices of the runs in their campaign.
-    initial_state : array, shape (uav, 12)
-        State at the start, the same for every run (Eq. 1).
-    obstacles_of : callable
-        Maps a range of runs to their scenes: one a run, or one for all.
+    data_folder : Path, optional
+        Where data files lie.
+
+    Raises
+    ------
+    NapfError
+        If a scene cannot be built, data are missing, or the file cannot be written.
     """
-    scenes: list[dict[str, Any]] = []
-    shared = False
-    kept = runs[:MAX_SCENES]
-    for first in range(kept.start, kept.stop, _BATCH):
-        batch = range(first, min(first + _BATCH, kept.stop))
-        obstacles = obstacles_of(batch)
-        shared = obstacles.n_scenes == 1 and len(batch) > 1
-        if shared:
-            scenes = [{"run": None, "obstacles": [shape_to_json(s) for s in obstacles.shapes(0)]}]
-            break
-        for i, run in enumerate(batch):
-            scenes.append({"run": run, "obstacles": [shape_to_json(s) for s in obstacles.shapes(i)]})
     table = {
-        "problem": problem,
+        "problem": problem.model_dump(mode="json"),
         "seed": seed,
         "first_run": runs.start,
         "runs": len(runs),
-        "initial_state": initial_state.tolist(),
-        "scenes": scenes,
+        "initial_state": _start(problem).tolist(),
+        "scenes": _scenes(problem, seed, runs, data_folder),
     }
     store.write_json(path, table, indent=None)
+
+
+def _start(problem: Problem) -> Array:
+    """State at the start (uav, 12), the same for every run (Eq. 1); a walking point has a place only (1, 3)."""
+    if isinstance(problem.mission, FormationMission):
+        return initial_state(problem)
+    return np.array([[*problem.mission.start_m, 0.0]])
+
+
+def _scenes(problem: Problem, seed: int, runs: range, data_folder: Path | None) -> list[dict[str, Any]]:
+    scenes: list[dict[str, Any]] = []
+    written = 0
+    for first in range(runs.start, runs.stop, _BATCH):
+        batch = runs[first - runs.start : first - runs.start + _BATCH]
+        obstacles = scenes_of(problem, seed, batch, data_folder)
+        if obstacles.n_scenes == 1 and len(runs) > 1 and len(batch) > 1:
+            return [{"run": None, "obstacles": _shapes(obstacles, 0)}]
+        for i, run in enumerate(batch):
+            scenes.append({"run": run, "obstacles": _shapes(obstacles, i)})
+            written += len(scenes[-1]["obstacles"])
+            if written >= MAX_OBSTACLES:
+                return scenes
+    return scenes
+
+
+def _shapes(obstacles: ObstacleSet, scene: int) -> list[dict[str, Any]]:
+    return [shape_to_json(shape) for shape in obstacles.shapes(scene)]
 
 
 def read_scenes(path: Path) -> dict[int | None, list[Shape]]:
@@ -131,7 +161,8 @@ def read_scenes(path: Path) -> dict[int | None, list[Shape]]:
     """
     table = store.read_json(path)
     try:
-        scenes: Sequence[dict[str, Any]] = table["scenes"]
-        return {scene["run"]: [shape_from_json(shape) for shape in scene["obstacles"]] for scene in scenes}
+        return {
+            scene["run"]: [shape_from_json(shape) for shape in scene["obstacles"]] for scene in table["scenes"]
+        }
     except (KeyError, TypeError) as error:
         raise DataError(f"{path}: not a scenario of ours: {error!r}") from error

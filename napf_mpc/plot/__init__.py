@@ -1,1 +1,20 @@
-"""x."""
+"""Figures of a run, of the paper by its numbers, of comparisons; animations. The one home of matplotlib.
+
+Nothing here uses pyplot: no display, no global state, and every figure comes out as the same file twice.
+"""
+
+from napf_mpc.plot.animate import animation
+from napf_mpc.plot.compare import compare_figures
+from napf_mpc.plot.flight import run_figures
+from napf_mpc.plot.overview import Mission, paths_overview, pick_missions
+from napf_mpc.plot.paper import paper_figures
+
+__all__ = [
+    "Mission",
+    "animation",
+    "compare_figures",
+    "paper_figures",
+    "paths_overview",
+    "pick_missions",
+    "run_figures",
+]

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import PercentFormatter
@@ -29,8 +28,6 @@ from napf_mpc.risk import Rate, wilson
 
 TRADES = (("shape_rms_m", "Shape RMS (m)"), ("path_rms_m", "Path RMS (m)"))
 """Metrics that are set against the risk."""
-NEAR_M = 3.0
-"""Clearance up to which the distribution is drawn [m]."""
 
 
 def compare_figures(
@@ -89,13 +86,14 @@ def risk_figure(summary: Mapping[str, Any], reference: Reference | None = None, 
     lines: list[tuple[str, str, float, float, float, bool]] = []
     for name, part in planners.items():
         risk = (part["collision_risk"], part["collision_risk_low"], part["collision_risk_high"])
-        lines.append((name, f"{planner_name(name)}, N = {part['runs']:,}".replace(",", " "), *risk, True))
+        lines.append((name, f"{planner_name(name)}, N = {part['runs']}", *risk, True))
         if name in theirs:
             paper = theirs[name]
             label = f"{planner_name(name)}, published, N = {paper.total}"
             lines.append((name, label, paper.value, paper.low, paper.high, False))
-    row, bottom, top, left = 0.25, 0.42, 0.08, 1.75 if theirs else 1.15
-    page = Page.of_size(COLUMN_IN, bottom + row * len(lines) + top, credit)
+    row, bottom, top, left = 0.25, 0.42, 0.08, 1.78 if theirs else 1.15
+    notes = [credit] if reference is None else [f"Published: {reference.source}.", reference.note, credit]
+    page = Page.of_size(COLUMN_IN, bottom + row * len(lines) + top, " ".join(note for note in notes if note))
     axes = page.axes(left, bottom, COLUMN_IN - left - 0.18, row * len(lines))
     for place, (name, _, value, low, high, ours) in enumerate(lines):
         height = len(lines) - 1 - place
@@ -114,9 +112,9 @@ def risk_figure(summary: Mapping[str, Any], reference: Reference | None = None, 
         )
     axes.set_yticks(range(len(lines)), [line[1] for line in reversed(lines)])
     axes.set(ylim=(-0.6, len(lines) - 0.4), xlim=(0.0, _round_up(max(line[4] for line in lines))))
-    axes.set_xlabel("Runs with an obstacle contact (%),\n95 % interval" if False else "Collision risk (%), 95 % interval")
+    axes.set_xlabel("Collision risk (%), 95 % interval")
     axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
-    axes.tick_params(axis="y", length=0.0)
+    axes.tick_params(axis="y", length=0.0, pad=7.0)
     axes.spines["left"].set_visible(False)
     axes.grid(axis="x", color="#E4E4E4", linewidth=0.5)
     axes.set_axisbelow(True)
@@ -131,13 +129,13 @@ def _round_up(share: float) -> float:
 
 
 def trade_figure(summary: Mapping[str, Any], credit: str = "") -> Figure:
-    """Risk against formation error: median, 5th to 95th percentile and 95 % interval of the risk; the floor is marked.
+    """Collision risk with its 95 % interval against formation error, median and 5th to 95th percentile.
 
-    The floor is the shape error that the navigation errors alone would cause if every UAV sat on its
-    estimate's slot.
+    A dashed line marks ``shape_floor_m``: the shape error that the navigation errors alone would cause if
+    every UAV sat on its estimate's slot. A UAV too slow to follow its estimate can stay below.
     """
     planners: Mapping[str, Any] = summary["planners"]
-    left, gap, bottom, tall, top = 0.5, 0.25, 0.4, 2.0, 0.28
+    left, gap, bottom, tall, top = 0.5, 0.25, 0.4, 2.0, 0.44
     wide = (PAGE_IN - left - gap - 0.1) / 2
     page = Page.of_size(PAGE_IN, bottom + tall + top, credit)
     highest = _round_up(max(part["collision_risk_high"] for part in planners.values()))
@@ -171,8 +169,8 @@ def trade_figure(summary: Mapping[str, Any], credit: str = "") -> Figure:
             floor = float(np.median(known))
             axes.axvline(floor, color=GREY, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1)
             axes.annotate(
-                "floor", (floor, 1.0), xycoords=("data", "axes fraction"), xytext=(-3, -2),
-                textcoords="offset points", ha="right", va="top", color=GREY,
+                "navigation errors alone", (floor, 1.0), xycoords=("data", "axes fraction"),
+                xytext=(0, 2), textcoords="offset points", ha="center", va="bottom", color=GREY,
             )  # fmt: skip
             reach = max(reach, floor)
         axes.set(xlim=(0.0, 1.06 * reach or 1.0), ylim=(0.0, highest), xlabel=words)
@@ -180,9 +178,10 @@ def trade_figure(summary: Mapping[str, Any], credit: str = "") -> Figure:
         axes.tick_params(labelleft=place == 0)
         if place == 0:
             axes.set_ylabel("Collision risk (%)")
-    handles = _planner_handles(planners)
-    note = "bars: 5th to 95th percentile of runs, 95 % interval of the risk"
-    page.legend([*handles, Line2D([], [], color=GREY, label=note)], bottom + tall + top - 0.02, x=left)
+    edge = bottom + tall + top - 0.02
+    page.legend(_planner_handles(planners), edge, x=left)
+    note = "bars: 5th to 95th percentile of runs; 95 % interval of the risk"
+    page.text(PAGE_IN - 0.1, edge, note, ha="right", va="top", color=GREY)
     return page.figure
 
 
@@ -196,7 +195,7 @@ def _planner_handles(planners: Mapping[str, Any]) -> list[Line2D]:
 def clearance_figure(
     summary: Mapping[str, Any], rows: Mapping[str, NDArray[Any]], credit: str = ""
 ) -> Figure:
-    """Distribution over runs of the least clearance to an obstacle; what lies left of zero are the collisions."""
+    """Distribution of the least clearance of a run from an obstacle; the collisions lie left of zero."""
     planners: Sequence[str] = list(summary["planners"])
     page = Page.of_size(COLUMN_IN, 2.5, credit)
     axes = page.axes(0.5, 0.42, COLUMN_IN - 0.5 - 0.12, 1.8)
@@ -206,8 +205,10 @@ def clearance_figure(
         x, y = ecdf(values)
         if len(x) == 0:
             continue
-        axes.plot(x, y, drawstyle="steps-post", color=planner_colour(name), linewidth=1.2)
         lowest, highest = min(lowest, float(x[1])), max(highest, float(np.quantile(x[1:], 0.99)))
+        # The steps go on to both sides, beyond every edge.
+        x = np.concatenate([[x[1] - 1e3], x[1:], [x[-1] + 1e3]])
+        axes.plot(x, [*y, 1.0], drawstyle="steps-post", color=planner_colour(name), linewidth=1.2)
     axes.axvline(0.0, color=BLACK, linewidth=0.8, linestyle=(0, (4, 2)), zorder=2)
     axes.annotate("contact", (0.0, 1.0), xycoords=("data", "axes fraction"), xytext=(-3, 1),
                   textcoords="offset points", ha="right", va="top", rotation=90)  # fmt: skip
@@ -215,10 +216,18 @@ def clearance_figure(
     axes.set_xlabel("Least clearance of a run (m)")
     axes.set_ylabel("Runs with less (%)")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
-    page.legend(
-        [Line2D([], [], color=planner_colour(name), linewidth=1.2, label=planner_name(name)) for name in planners],
-        2.46,
-    )
+    counts = {name: int(summary["planners"][name]["runs"]) for name in planners}
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=planner_colour(name),
+            linewidth=1.2,
+            label=f"{planner_name(name)}, N = {counts[name]}",
+        )
+        for name in planners
+    ]
+    page.legend(handles, 2.46)
     return page.figure
 
 

@@ -145,7 +145,8 @@ def paths_figure(
     seen = np.concatenate([each.position.reshape(-1, 3) for each in (flown, *beside)])
     view = scene.view_of(seen, obstacles, pad_m=2.0, reach_m=12.0)
     label_m = 0.075 * max(view.width, view.height) if few else 0.0
-    view = scene.View((view.x[0], view.x[1] + label_m), view.y)
+    westward = frame.along[0] < -0.5
+    view = scene.View((view.x[0] - label_m * westward, view.x[1] + label_m * (not westward)), view.y)
     along = frame.along_track(seen)
     span = view.x if level else (float(along.min()) - 2.0, float(along.max()) + 2.0)
     left, right, bottom, gap, top = 0.58, 0.08, 0.4, 0.32, 0.28
@@ -166,23 +167,21 @@ def paths_figure(
     side.set(xlim=span, ylim=(low, high), ylabel="Up z (m)")
     side.set_xlabel("East x (m)" if level else "Along the path (m)")
     for axes, width in ((plan, plan_w), (side, side_w)):
-        axes.locator_params(axis="y", nbins=5, steps=[1, 2, 5, 10])
+        axes.locator_params(axis="y", nbins=6, steps=[1, 2, 5, 10])
         axes.yaxis.set_label_coords(-0.42 / width, 0.5)
     scene.draw_plan(plan, obstacles, view)
-    scene.draw_side(side, obstacles, frame, view)
+    scene.draw_side(side, obstacles, frame, view, float(seen[:, 2].max()))
     draw_paths(plan, flown.position[..., 0], flown.position[..., 1], label=few)
     horizontal = flown.position[..., 0] if level else frame.along_track(flown.position)
     draw_paths(side, horizontal, flown.position[..., 2], label=False)
     found = contacts(flown, obstacles, problem.vehicle.radius_m)
     mark_contacts(plan, [(each.position[0], each.position[1]) for each in found])
-    mark_contacts(
-        side,
-        [(each.position[0] if level else float(frame.along_track(each.position)), each.position[2]) for each in found],
-    )
+    across = [each.position[0] if level else float(frame.along_track(each.position)) for each in found]
+    mark_contacts(side, [(place, each.position[2]) for place, each in zip(across, found, strict=True)])
     page.text(left, height - 0.02, flight_title(problem, flown), va="top")
     handles: list[Any] = [scene.start_mark(), scene.end_mark()]
     if len(obstacles):
-        handles.append(scene.obstacle_mark())
+        handles.append(scene.obstacle_mark(obstacles))
     if found:
         handles.append(scene.contact_mark())
     page.legend(handles, height - 0.02, x=left + 1.9)
@@ -214,9 +213,11 @@ def draw_paths(axes: Axes, x: Array, y: Array, label: bool) -> None:
     if not label:
         return
     inch = _metres_per_inch(axes)
-    right = float(x[-1].max()) + 0.09 * inch
+    westward = float(x[-1].mean()) < float(x[0].mean())
+    place = float(x[-1].min()) - 0.09 * inch if westward else float(x[-1].max()) + 0.09 * inch
     for uav, height in enumerate(spread(y[-1], 0.135 * inch).tolist()):
-        axes.text(right, height, f"UAV {uav + 1}", color=uav_colour(uav), va="center")
+        side = "right" if westward else "left"
+        axes.text(place, height, f"UAV {uav + 1}", color=uav_colour(uav), va="center", ha=side)
 
 
 def mark_contacts(axes: Axes, places: Sequence[tuple[float, float]]) -> None:
@@ -233,7 +234,7 @@ def _metres_per_inch(axes: Axes) -> float:
 
 
 def spread(places: Array, gap: float) -> Array:
-    """Move places (n,) apart until neighbours are at least a gap apart, in the same order, around their middle."""
+    """Move places (n,) apart, in the same order and around their middle, until no gap is smaller than one."""
     out = np.array(places, dtype=float)
     groups: list[list[int]] = []
     for index in np.argsort(places, kind="stable").tolist():
@@ -278,9 +279,7 @@ def uncertainty_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -
     shapes = obstacles.shapes() if inflates else []
     for place, uav in enumerate(shown):
         row, column = divmod(place, columns)
-        axes = page.axes(
-            left + column * (wide + gap), bottom + (rows - 1 - row) * (tall + title), wide, tall
-        )
+        axes = page.axes(left + column * (wide + gap), bottom + (rows - 1 - row) * (tall + title), wide, tall)
         axes.set(xlim=view.x, ylim=view.y)
         axes.set_title(f"UAV {uav + 1}", color=uav_colour(uav), pad=2.0)
         last_in_column = place + columns >= len(shown)

@@ -135,7 +135,7 @@ def overview_figure(
     wide = (PAGE_IN - left - right - gap * (columns - 1)) / columns
     tall = wide * view.height / view.width
     shaded = any(scene.shades_heights(obstacles) for obstacles in scenes.values())
-    height = bottom + rows * (tall + title) + top + 0.45 * shaded
+    height = bottom + rows * (tall + title) + top + 0.5 * shaded
     page = Page.of_size(PAGE_IN, height, credit_of(problem))
     base = height - top - rows * (tall + title)
     found_any = False
@@ -153,11 +153,13 @@ def overview_figure(
         mark_contacts(axes, [(contact.position[0], contact.position[1]) for contact in found])
         found_any |= bool(found)
         words = f": {mission.words}" if mission.words else ""
-        axes.set_title(f"({chr(97 + place)}) {planner_name(mission.planner)}, run {mission.run}{words}", pad=3.0)
+        axes.set_title(
+            f"({chr(97 + place)}) {planner_name(mission.planner)}, run {mission.run}{words}", pad=3.0
+        )
     if shaded:
         bar = page.figure.colorbar(
             ScalarMappable(scene.HEIGHT_SHADES, scene.height_colours()),
-            cax=page.axes(left + 1.2, 0.3, 2.4, 0.09),
+            cax=page.axes(left + 1.2, 0.36, 2.4, 0.09),
             orientation="horizontal",
             extend="max",
         )

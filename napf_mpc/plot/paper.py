@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from napf_mpc.campaign import fly_block
-from napf_mpc.formation import PathFrame
+from napf_mpc.block import fly_block
+from napf_mpc.goal_walk import goal_scenes
 from napf_mpc.plot.field import surface_figure, walk_figure
 from napf_mpc.plot.flight import paths_figure, run_figures
 from napf_mpc.plot.states import angle_figure, axis_figure
@@ -17,8 +16,6 @@ from napf_mpc.plot.style import house_style, save
 from napf_mpc.plot.tracks import Track, track
 from napf_mpc.problem import GoalMission, Problem
 from napf_mpc.simulate import build_scenario
-from napf_mpc.world.obstacles import ObstacleSet
-from napf_mpc.world.scenes import build_scenes
 
 EVERY = 5
 """Ticks of the inner loop between two drawn samples (0.1 s at 50 Hz)."""
@@ -102,10 +99,8 @@ def _fly(problem: Problem, planners: Sequence[str], seed: int, data_folder: Path
     return [track(flown.trajectories, planner, 0) for planner in planners]
 
 
-def _goal_figures(
-    problem: Problem, name: str, seed: int, out: Path, data_folder: Path | None
-) -> list[Path]:
-    obstacles = goal_scene(problem, seed, data_folder)
+def _goal_figures(problem: Problem, name: str, seed: int, out: Path, data_folder: Path | None) -> list[Path]:
+    obstacles = goal_scenes(problem, seed, data_folder=data_folder).scene(0)
     written = []
     with house_style():
         if name != "single_uav":
@@ -113,12 +108,3 @@ def _goal_figures(
         if name != "potential_surface":
             written += save(walk_figure(problem, obstacles), out, "fig04_single_uav")
     return written
-
-
-def goal_scene(problem: Problem, seed: int, data_folder: Path | None = None) -> ObstacleSet:
-    """Obstacles of a problem whose mission is a walk to a goal."""
-    assert isinstance(problem.mission, GoalMission)
-    start, goal = np.array(problem.mission.start_m), np.array(problem.mission.goal_m)
-    heading = float(np.arctan2(*(goal - start)[::-1]))
-    frame = PathFrame.from_angles((*problem.mission.start_m, 0.0), heading, 0.0)
-    return build_scenes(problem.world, frame, np.zeros(1), seed, range(1), data_folder).scene(0)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.formation import PathFrame
 from napf_mpc.plot.style import BLACK, GREY, PALE, RULE
-from napf_mpc.world.distance import PRISM
+from napf_mpc.world.distance import BOX, PRISM
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 
@@ -117,7 +118,7 @@ def _outline(rings: Sequence[Array]) -> Outline:
 
 def shades_heights(obstacles: ObstacleSet) -> bool:
     """Whether greys stand for heights: in scenes with buildings."""
-    return bool((obstacles.solids.kind == PRISM).any())
+    return bool(np.isin(obstacles.solids.kind, (BOX, PRISM)).any())
 
 
 def height_colours() -> ListedColormap:
@@ -145,28 +146,31 @@ def draw_plan(axes: Axes, obstacles: ObstacleSet, view: View) -> None:
     axes.add_collection(collection, autolim=False)
 
 
-def draw_side(axes: Axes, obstacles: ObstacleSet, frame: PathFrame, view: View) -> None:
-    """Draw the obstacles in view from the side, along the path against height; those without end fill it."""
+def draw_side(axes: Axes, obstacles: ObstacleSet, frame: PathFrame, view: View, ceiling_m: float) -> None:
+    """Draw the obstacles in view from the side, along the path against height.
+
+    Spheres, and others that end below the highest path: the rest would only hide the paths, which go round.
+    """
     if len(obstacles) == 0:
         return
     lower, upper = obstacles.boxes
     shapes = obstacles.shapes()
-    low_z, high_z = axes.get_ylim()
+    low_z, _ = axes.get_ylim()
     for i in np.flatnonzero(view.shows(lower, upper)).tolist():
         shape = shapes[i]
         if isinstance(shape, Sphere):
             along = float(frame.along_track(np.array(shape.centre_m)))
             axes.add_patch(Circle((along, shape.centre_m[2]), shape.radius_m, **_SOLID))
-            continue
-        corners = _ground_corners(shape, float(frame.origin[2]))
-        along_all = frame.along_track(corners)
-        base, top = max(float(lower[i, 2]), low_z), min(float(upper[i, 2]), high_z)
-        if top > base:
+        elif low_z < upper[i, 2] < ceiling_m:
+            along_all = frame.along_track(_ground_corners(shape, float(frame.origin[2])))
             span = (float(along_all.min()), float(along_all.max()))
-            axes.fill_between(span, base, top, color=PALE, alpha=0.5, linewidth=0.0, zorder=1.0)
+            base = max(float(lower[i, 2]), low_z)
+            axes.fill_between(
+                span, base, float(upper[i, 2]), color=PALE, alpha=0.5, linewidth=0.0, zorder=1.0
+            )
 
 
-_SOLID = {"facecolor": PALE, "edgecolor": RULE, "linewidth": 0.6, "zorder": 1.0}
+_SOLID: dict[str, Any] = {"facecolor": PALE, "edgecolor": RULE, "linewidth": 0.6, "zorder": 1.0}
 
 
 def _ground_corners(shape: Box | Cylinder | Prism, height_m: float) -> Array:
@@ -190,7 +194,9 @@ def draw_inflated(
     """
     if isinstance(shape, (Sphere, Cylinder)):
         radius = shape.radius_m + margin_m
-        circle = Circle(shape.centre_m[:2], radius, fill=False, edgecolor=colour, linewidth=0.7, linestyle=DASHES)
+        circle = Circle(
+            shape.centre_m[:2], radius, fill=False, edgecolor=colour, linewidth=0.7, linestyle=DASHES
+        )
         circle.set_zorder(1.5)
         return axes.add_patch(circle)
     alone = ObstacleSet.from_shapes([shape])
@@ -255,7 +261,9 @@ def end_mark() -> Line2D:
 
 def contact_mark() -> Line2D:
     """Legend entry for a contact."""
-    return Line2D([], [], label="contact", linestyle="", marker="X", markersize=6, mfc=BLACK, mec="white", mew=0.5)
+    return Line2D(
+        [], [], label="contact", linestyle="", marker="X", markersize=6, mfc=BLACK, mec="white", mew=0.5
+    )
 
 
 def inflated_mark(k: float) -> Line2D:
@@ -264,6 +272,7 @@ def inflated_mark(k: float) -> Line2D:
     return Line2D([], [], color=INFLATED_COLOUR, linewidth=0.7, linestyle=DASHES, label=words)
 
 
-def obstacle_mark() -> Patch:
+def obstacle_mark(obstacles: ObstacleSet) -> Patch:
     """Legend entry for obstacles."""
-    return Patch(facecolor=PALE, edgecolor=RULE, linewidth=0.6, label="obstacle")
+    words = "obstacle (darker: taller)" if shades_heights(obstacles) else "obstacle"
+    return Patch(facecolor=PALE, edgecolor=RULE, linewidth=0.6, label=words)

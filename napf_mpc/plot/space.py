@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.plot import scene
 from napf_mpc.plot.states import uav_handles
-from napf_mpc.plot.style import PAGE_IN, PALE, Page, credit_of, planner_name, uav_colour
+from napf_mpc.plot.style import GREY, PAGE_IN, PALE, Page, credit_of, plain_panes, planner_name, uav_colour
 from napf_mpc.plot.tracks import Track
 from napf_mpc.problem import Problem
 from napf_mpc.world.obstacles import ObstacleSet
@@ -46,11 +46,11 @@ def space_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figu
     sides = (view.width, view.height, high - low)
     wide, tall = _seen_size(sides)
     scale = min((PAGE_IN - 1.5) / wide, 4.0 / tall)
-    height = scale * tall + 1.15
+    height = scale * tall + 0.85
     page = Page.of_size(PAGE_IN, height, credit_of(problem))
     # mplot3d has no type information.
     # Its axes are square and clip to the square: as wide as the page, they reach beyond its edges.
-    low_edge = 0.5 * (height - 0.2 - PAGE_IN)
+    low_edge = 0.45 + 0.5 * (scale * tall - PAGE_IN)
     axes = cast(Any, page.axes(0.0, low_edge, PAGE_IN, PAGE_IN, projection="3d", computed_zorder=False))
     for shape in shown:
         _draw_solid(axes, shape, low, high)
@@ -68,12 +68,10 @@ def space_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figu
     axes.locator_params(axis="y", nbins=4)
     axes.locator_params(axis="z", nbins=4)
     axes.set_xlabel("East x (m)", labelpad=12.0)
-    axes.set_ylabel("North y (m)", labelpad=2.0)
+    axes.set_ylabel("North y (m)", labelpad=5.0)
     axes.set_zlabel("Up z (m)", labelpad=-2.0)
     axes.tick_params(pad=-1.0)
-    for pane in (axes.xaxis, axes.yaxis, axes.zaxis):
-        pane.set_pane_color((1.0, 1.0, 1.0, 0.0))
-        pane._axinfo["grid"].update(color="#E4E4E4", linewidth=0.4)
+    plain_panes(axes)
     page.text(0.1, height - 0.02, planner_name(flown.planner), va="top")
     page.legend(uav_handles(flown.uavs), height - 0.02)
     return page.figure
@@ -98,7 +96,7 @@ def _draw_solid(axes: Any, shape: Shape, low: float, high: float) -> None:
         x = shape.centre_m[0] + shape.radius_m * around * np.cos(turn)
         y = shape.centre_m[1] + shape.radius_m * around * np.sin(turn)
         z = shape.centre_m[2] + shape.radius_m * np.cos(polar)
-        axes.plot_surface(x, y, z, color=PALE, alpha=0.75, linewidth=0.0, zorder=2, rcount=13, ccount=21, rasterized=True)
+        axes.plot_surface(x, y, z, alpha=0.75, rcount=13, ccount=21, **_FACE)
         return
     if isinstance(shape, Box):
         base, top = shape.centre_m[2] - 0.5 * shape.size_m[2], shape.centre_m[2] + 0.5 * shape.size_m[2]
@@ -108,10 +106,12 @@ def _draw_solid(axes: Any, shape: Shape, low: float, high: float) -> None:
         closed = np.concatenate([ring, ring[:1]])
         walls = np.stack([np.full(len(closed), base), np.full(len(closed), top)])
         x, y = np.broadcast_to(closed.T[:, None], (2, 2, len(closed)))
-        axes.plot_surface(
-            x, y, walls, color=PALE, alpha=0.35, linewidth=0.0, zorder=2, rcount=2, ccount=len(closed), rasterized=True
-        )
-        axes.plot(closed[:, 0], closed[:, 1], np.full(len(closed), top), color="#6E6E6E", linewidth=0.4, zorder=3)
+        axes.plot_surface(x, y, walls, alpha=0.35, rcount=2, ccount=len(closed), **_FACE)
+        axes.plot(*closed.T, np.full(len(closed), top), color=GREY, linewidth=0.4, zorder=3)
+
+
+# Faces go into SVG files as pictures; as thousands of small polygons they would be large and slow.
+_FACE: dict[str, Any] = {"color": PALE, "linewidth": 0.0, "zorder": 2, "rasterized": True}
 
 
 def _rings(shape: Box | Cylinder | Prism) -> tuple[Array, ...]:

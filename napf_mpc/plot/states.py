@@ -29,10 +29,12 @@ Array = NDArray[np.float64]
 
 MAX_LEGEND = 8
 """Formations up to this size are named in legends."""
-FAR_M = 15.0
-"""Clearances above this are cut off: they say nothing."""
+FAR = 5.0
+"""Distances above this many ranges of influence are cut off: they say nothing."""
 
-_LEFT, _RIGHT, _BOTTOM, _TOP, _ROW_GAP = 0.52, 0.08, 0.38, 0.26, 0.13
+_LEFT, _RIGHT, _BOTTOM, _TOP, _ROW_GAP = 0.58, 0.08, 0.4, 0.26, 0.14
+_LABEL = 0.42
+"""Distance of labels from their axis, so that they stand in line [in]."""
 
 AXES = "xyz"
 ANGLES = ("roll", "pitch", "yaw")
@@ -68,6 +70,7 @@ def _grid(
     for row, line in enumerate(panels):
         for axes in line:
             axes.tick_params(labelbottom=row == rows - 1)
+            axes.yaxis.set_label_coords(-_LABEL / wide, 0.5)
             if row == rows - 1:
                 axes.set_xlabel("Time (s)")
     return page, panels, height
@@ -75,7 +78,7 @@ def _grid(
 
 def motion_figure(problem: Problem, flown: Track) -> Figure:
     """Position and velocity of every UAV along each axis over time (truth)."""
-    page, panels, height = _grid(3, 2, PAGE_IN, 1.15, 0.62, credit_of(problem))
+    page, panels, height = _grid(3, 2, PAGE_IN, 1.15, 0.66, credit_of(problem))
     for axis, (left, right) in enumerate(panels):
         draw_over_time(left, flown.time_s, flown.position[..., axis])
         draw_over_time(right, flown.time_s, flown.velocity[..., axis])
@@ -87,7 +90,7 @@ def motion_figure(problem: Problem, flown: Track) -> Figure:
 
 def attitude_figure(problem: Problem, flown: Track) -> Figure:
     """Roll, pitch and yaw of every UAV with their rates over time (truth)."""
-    page, panels, height = _grid(3, 2, PAGE_IN, 1.15, 0.62, credit_of(problem))
+    page, panels, height = _grid(3, 2, PAGE_IN, 1.15, 0.66, credit_of(problem))
     for axis, (left, right) in enumerate(panels):
         _draw_angle(left, right, flown, axis)
         left.set_ylabel(f"{ANGLES[axis].capitalize()} (°)")
@@ -165,31 +168,30 @@ def _share(panels: list[list[Axes]]) -> None:
 
 
 def distance_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figure:
-    """Clearance to the nearest obstacle and distance to the nearest UAV over time, with the lines of contact."""
+    """Clearance from the nearest obstacle and separation from the nearest UAV, with the lines of contact."""
     lone = flown.uavs == 1
     rows = 1 if lone else 2
     page, panels, height = _grid(rows, 1, COLUMN_IN, 1.3, 0.0, credit_of(problem))
     vehicle = problem.vehicle
     clearance = clearances(flown, obstacles, vehicle.radius_m)
     axes = panels[0][0]
-    _draw_distance(axes, flown.time_s, clearance, 0.0, "contact")
-    axes.set_ylabel("Clearance to\nobstacle (m)")
+    far = FAR * problem.planner.influence_m
+    _draw_distance(axes, flown.time_s, clearance, 0.0, far, "obstacle touched")
+    axes.set_ylabel("Clearance (m)")
     if not np.isfinite(clearance).any():
         axes.text(0.5, 0.5, "no obstacles", transform=axes.transAxes, ha="center", color=GREY)
     if not lone:
-        axes = panels[1][0]
-        _draw_distance(
-            axes, flown.time_s, separations(flown), vehicle.min_separation_m, f"contact: {vehicle.min_separation_m:g} m"
-        )
-        axes.set_ylabel("Distance to\nnearest UAV (m)")
+        axes, least = panels[1][0], vehicle.min_separation_m
+        _draw_distance(axes, flown.time_s, separations(flown), least, far, f"UAVs in contact: {least:g} m")
+        axes.set_ylabel("Separation (m)")
     page.legend(uav_handles(flown.uavs), height - 0.02)
     return page.figure
 
 
-def _draw_distance(axes: Axes, time_s: Array, values: Array, limit: float, words: str) -> None:
+def _draw_distance(axes: Axes, time_s: Array, values: Array, limit: float, far_m: float, words: str) -> None:
     finite = values[np.isfinite(values)]
     draw_over_time(axes, time_s, np.where(np.isfinite(values), values, np.nan))
-    high = min(FAR_M, float(finite.max()) if len(finite) else 1.0)
+    high = min(far_m, float(finite.max()) if len(finite) else 1.0)
     low = min(limit, float(finite.min()) if len(finite) else 0.0)
     pad = 0.08 * (high - low)
     axes.set_ylim(low - max(pad, 0.3), max(high, limit + 1.0))

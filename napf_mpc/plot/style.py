@@ -1,4 +1,4 @@
-"""House style of all figures: sizes, colours, pages laid out in inches, and files that come out the same twice."""
+"""House style of all figures: sizes, colours, pages laid out in inches, and files that are the same twice."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import matplotlib.style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from napf_mpc.problem import Problem
 from napf_mpc.store import output_folder, write_bytes
@@ -27,7 +28,7 @@ FONT_PT = 8.0
 CREDIT_PT = 7.0
 """Size of the credit line [pt]."""
 
-# Okabe and Ito's palette, told apart with any common colour vision; its yellow is too pale for lines on white.
+# Okabe and Ito's palette, told apart with any common colour vision; their yellow is too pale for lines.
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 UAV_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
@@ -91,13 +92,13 @@ def planner_name(planner: str) -> str:
 
 def credit_of(problem: Problem) -> str:
     """Source and licence of the shared data behind a problem, empty if it uses none."""
-    credits = [getattr(problem.world, "credit", ""), getattr(problem.navigation, "credit", "")]
-    return "; ".join(dict.fromkeys(text for text in credits if text))
+    sources = [getattr(problem.world, "credit", ""), getattr(problem.navigation, "credit", "")]
+    return ". ".join(dict.fromkeys(text.rstrip(".") for text in sources if text))
 
 
 @dataclass(frozen=True)
 class Page:
-    """Figure laid out in inches from the lower left corner of its drawing area; a credit line stands below."""
+    """Figure laid out in inches from the lower left corner of its drawing area, a credit line below."""
 
     figure: Figure
     """The figure."""
@@ -112,12 +113,13 @@ class Page:
         figure = Figure(figsize=(width_in, height_in + footer))
         if lines:
             y = (footer - 0.02) / (height_in + footer)
-            figure.text(
-                0.06 / width_in, y, "\n".join(lines), fontsize=CREDIT_PT, color=GREY, va="top", linespacing=1.15
-            )
+            words = "\n".join(lines)
+            figure.text(0.06 / width_in, y, words, fontsize=CREDIT_PT, color=GREY, va="top", linespacing=1.15)
         return cls(figure, footer)
 
-    def _fraction(self, left: float, bottom: float, width: float, height: float) -> tuple[float, ...]:
+    def _fraction(
+        self, left: float, bottom: float, width: float, height: float
+    ) -> tuple[float, float, float, float]:
         full_width, full_height = self.figure.get_size_inches()
         return (
             left / full_width,
@@ -131,10 +133,10 @@ class Page:
         left, bottom, width, height = self._fraction(left, bottom, width, height)
         return self.figure.add_axes((left, bottom, width, height), **options)
 
-    def text(self, x: float, y: float, words: str, **options: Any) -> None:
+    def text(self, x: float, y: float, words: str, **options: Any) -> Text:
         """Text at a place [in]."""
         x, y, _, _ = self._fraction(x, y, 0.0, 0.0)
-        self.figure.text(x, y, words, **options)
+        return self.figure.text(x, y, words, **options)
 
     def legend(self, handles: Sequence[Any], y: float, x: float | None = None, columns: int = 0) -> None:
         """One legend for all panels, its upper edge at a height [in], outside every frame."""
@@ -152,8 +154,15 @@ class Page:
         )
 
 
+def plain_panes(axes: Any) -> None:
+    """Give axes in space white walls with a pale grid (mplot3d has no type information)."""
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+        axis._axinfo["grid"].update(color="#E4E4E4", linewidth=0.4)
+
+
 def save(figure: Figure, out: Path, stem: str) -> list[Path]:
-    """Write a figure as ``stem.png`` and ``stem.svg``: no dates or version marks, so the same figure is the same file.
+    """Write a figure as ``stem.png`` and ``stem.svg``, without dates: the same figure is the same file.
 
     Raises
     ------
@@ -162,8 +171,7 @@ def save(figure: Figure, out: Path, stem: str) -> list[Path]:
     """
     folder = output_folder(out)
     png, svg = folder / f"{stem}.png", folder / f"{stem}.svg"
+    none: dict[str, Any] = {"Date": None, "Creator": None}
     write_bytes(png, lambda file: figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None}))
-    write_bytes(
-        svg, lambda file: figure.savefig(file, format="svg", dpi=DPI, metadata={"Date": None, "Creator": None})
-    )
+    write_bytes(svg, lambda file: figure.savefig(file, format="svg", dpi=DPI, metadata=none))
     return [png, svg]

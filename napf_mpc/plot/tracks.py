@@ -196,13 +196,13 @@ class Contact:
 
 
 def clearances(flown: Track, obstacles: ObstacleSet, radius_m: float) -> Array:
-    """Clearance (time, uav) of each UAV's hull from the nearest obstacle, on the truth; +inf without any [m]."""
+    """Clearance (time, uav) of each UAV's hull from the nearest obstacle (truth); +inf without any [m]."""
     distance = obstacles.signed_distance(flown.position.reshape(1, -1, 3))
     return distance.reshape(flown.position.shape[:2]) - radius_m
 
 
 def separations(flown: Track) -> Array:
-    """Distance (time, uav) of each UAV's centre from that of its nearest neighbour; +inf for a lone one [m]."""
+    """Distance (time, uav) of each UAV's centre from its nearest neighbour's; +inf for a lone one [m]."""
     out = np.full(flown.position.shape[:2], np.inf)
     for i in range(flown.uavs):
         gaps = np.sqrt(((flown.position - flown.position[:, i : i + 1]) ** 2).sum(-1))

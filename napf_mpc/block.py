@@ -1,0 +1,200 @@
+"""A block of runs in this process: every planner flown in lock-step through the same scenes and errors."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from napf_mpc import store
+from napf_mpc.errors import ProblemError
+from napf_mpc.evaluate import MissionScore, Score
+from napf_mpc.planners.planner import Planner
+from napf_mpc.planners.registry import make_planner
+from napf_mpc.problem import Problem
+from napf_mpc.record import TrajectoryRecorder
+from napf_mpc.simulate import Scenario, build_scenario, closed_loop
+from napf_mpc.summary import score_rows
+from napf_mpc.words import shown_value
+
+MAX_RUNS = 10_000_000
+MAX_SEED = 2**63 - 1
+MAX_WORKERS = 1024
+
+
+@dataclass(frozen=True)
+class Block:
+    """Results of some runs of a campaign."""
+
+    rows: store.Columns
+    """One row a planner and run: outcome and metrics."""
+    timing: store.Columns
+    """One row a planner: wall time of the block, kept apart from results."""
+    trajectories: store.Columns
+    """Rows by planner, run, time and UAV; no columns if not asked for."""
+
+
+@dataclass(frozen=True)
+class Missions:
+    """Missions of one planner, flown in this process."""
+
+    score: Score
+    """Verdicts and metrics on the truth."""
+    scenario: Scenario
+    """What they flew through."""
+    trajectories: store.Columns
+    """Rows by run, time and UAV; no columns if not asked for."""
+
+
+def simulate(
+    problem: Problem,
+    planner: str | Planner = "napf",
+    *,
+    seed: int = 0,
+    runs: int | range = 1,
+    record_every: int = 0,
+    data_folder: Path | None = None,
+) -> Missions:
+    """Fly missions in this process, all in lock-step, and judge them on the truth.
+
+    Thousands of runs at once take memory; :func:`napf_mpc.compare` and :func:`napf_mpc.run_campaign` cut
+    theirs into blocks.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation problem, see :func:`napf_mpc.load_problem`.
+    planner : str or Planner
+        Name, or a planner of your own.
+    seed : int
+        Campaign seed, 0 <= seed < 2**63.
+    runs : int or range
+        Number of runs, or their indices in the campaign of this seed.
+    record_every : int
+        Keep every n-th tick of the inner loop as trajectory; 0 for none.
+    data_folder : Path, optional
+        Where data files lie.
+
+    Returns
+    -------
+    Missions
+        Score, scenario and trajectories.
+
+    Raises
+    ------
+    NapfError
+        If a setting or the problem is not usable, or data are missing.
+    """
+    indices = runs if isinstance(runs, range) else range(_checked_count(runs))
+    if indices.step != 1 or indices.start < 0 or len(indices) == 0:
+        raise ProblemError("simulate", [f"runs = {indices}: must be one or more indices >= 0 without gaps"])
+    if record_every < 0:
+        raise ProblemError("simulate", [f"record_every = {record_every}: must be >= 0"])
+    pilot = make_planner(planner, problem) if isinstance(planner, str) else planner
+    check_campaign([pilot.name], indices.stop, seed)
+    scenario = build_scenario(problem, seed, indices, data_folder)
+    return Missions(*_fly(problem, pilot, scenario, record_every))
+
+
+def _checked_count(runs: int) -> int:
+    check_campaign(["any"], runs, 0)
+    return runs
+
+
+def fly_block(
+    problem: Problem,
+    planners: Sequence[str],
+    seed: int,
+    runs: range,
+    data_folder: Path | None = None,
+    record_every: int = 0,
+) -> Block:
+    """Fly some runs of a campaign with every planner, on the same scenes and errors.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation problem.
+    planners : sequence of str
+        Names of planners.
+    seed : int
+        Campaign seed.
+    runs : range
+        Indices of the runs.
+    data_folder : Path, optional
+        Where data files lie.
+    record_every : int
+        Keep every n-th tick of the trajectories; 0 for none.
+
+    Returns
+    -------
+    Block
+        Rows ordered by planner, then run. No row depends on which others are in the block.
+
+    Raises
+    ------
+    NapfError
+        If the problem cannot be flown or data are missing.
+    """
+    # More threads than one would make workers fight for the cores, and win nothing on small matrices.
+    with threadpool_limits(1):
+        scenario = build_scenario(problem, seed, runs, data_folder)
+        rows, timing, trajectories = [], [], []
+        for name in planners:
+            began = time.perf_counter()
+            score, _, track = _fly(problem, make_planner(name, problem), scenario, record_every)
+            timing.append(timing_row(name, runs, time.perf_counter() - began))
+            rows.append(score_rows(name, seed, score))
+            if track:
+                trajectories.append(track)
+    return Block(store.stack(rows), store.stack(timing), store.stack(trajectories))
+
+
+def _fly(
+    problem: Problem, planner: Planner, scenario: Scenario, record_every: int
+) -> tuple[Score, Scenario, store.Columns]:
+    judge = MissionScore(problem, scenario)
+    if not record_every:
+        return judge.score(closed_loop(problem, planner, scenario, (judge,))), scenario, {}
+    recorder = TrajectoryRecorder(planner.name, scenario.runs, record_every)
+    flight = closed_loop(problem, planner, scenario, (judge, recorder))
+    return judge.score(flight), scenario, recorder.columns()
+
+
+def timing_row(planner: str, runs: range, seconds: float) -> store.Columns:
+    """Wall time that a planner's flight of some runs took."""
+    return {
+        "planner": np.array([planner]),
+        "first_run": np.array([runs.start]),
+        "runs": np.array([len(runs)]),
+        "wall_s": np.array([seconds]),
+    }
+
+
+def check_campaign(planners: Sequence[str], runs: int, seed: int, workers: int = 1) -> None:
+    """Refuse campaign settings that cannot be meant.
+
+    Raises
+    ------
+    ProblemError
+        Naming every setting that is out of range.
+    """
+    faults = []
+    for name, value, low, high in (
+        ("runs", runs, 1, MAX_RUNS),
+        ("seed", seed, 0, MAX_SEED),
+        ("workers", workers, 1, MAX_WORKERS),
+    ):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
+            most = "2**63 - 1" if high == MAX_SEED else f"{high}"
+            faults.append(f"{name} = {shown_value(value)}: must be a whole number from {low} to {most}")
+    if isinstance(planners, str) or not planners:
+        faults.append("planners: give a list of at least one name")
+    elif len(set(planners)) != len(planners):
+        faults.append(f"planners = {','.join(planners)[:200]}: each may be named once")
+    if faults:
+        raise ProblemError("campaign", faults)

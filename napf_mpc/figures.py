@@ -1,0 +1,150 @@
+"""Which figures belong to what: a mission, a comparison, a problem, stored results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from napf_mpc import plot, store
+from napf_mpc.block import check_campaign, fly_block
+from napf_mpc.errors import DataError
+from napf_mpc.plot.field import surface_figure, walk_figure
+from napf_mpc.plot.style import credit_of, house_style, save
+from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.scenario_file import read_scenes, scenes_of
+from napf_mpc.world.obstacles import ObstacleSet
+
+SHOWN_EACH = 1
+"""Missions of each planner that went well, and that went badly, on the overview of a comparison."""
+
+
+def draw_mission(
+    problem: Problem,
+    name: str,
+    trajectories: store.Columns,
+    obstacles: ObstacleSet,
+    planners: Sequence[str],
+    out: Path,
+    animated: bool = False,
+) -> list[Path]:
+    """Draw one mission, or a point's walk to its goal.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was flown.
+    name : str
+        Its name, for the files' names.
+    trajectories : mapping of str to array
+        Every tick of it.
+    obstacles : ObstacleSet
+        What it flew through.
+    planners : sequence of str
+        Who flew.
+    out : Path
+        Folder.
+    animated : bool
+        Whether to make an animation too (some ten seconds).
+    """
+    if not isinstance(problem.mission, FormationMission):
+        with house_style():
+            return [
+                *save(surface_figure(problem, obstacles), out, f"{name}_potential"),
+                *save(walk_figure(problem, obstacles), out, f"{name}_walk"),
+            ]
+    written = plot.run_figures(problem, name, trajectories, obstacles, list(planners), out)
+    if animated:
+        for planner in planners:
+            path = out / f"{name}_{planner}.gif"
+            written.append(plot.animation(problem, trajectories, obstacles, path, planner))
+    return written
+
+
+def draw_problem(
+    problem: Problem, name: str, seed: int, out: Path, data_folder: Path | None = None
+) -> list[Path]:
+    """Fly run 0 of a seed and draw the paper's figures for a problem."""
+    check_campaign(["apf"], 1, seed)
+    return plot.paper_figures(problem, name, seed, store.output_folder(out), data_folder)
+
+
+def draw_comparison(
+    problem: Problem,
+    summary: dict[str, Any],
+    rows: store.Columns,
+    out: Path,
+    data_folder: Path | None = None,
+) -> list[Path]:
+    """Draw risks, costs and clearances of a campaign, and some of its missions that went well and badly.
+
+    The missions are flown again from their seeds.
+
+    Raises
+    ------
+    DataError
+        If they do not fly as they did, as with another version.
+    """
+    written = plot.compare_figures(summary, rows, out, problem.reference, credit_of(problem))
+    missions = plot.pick_missions(rows, SHOWN_EACH)
+    tracks = []
+    for mission in missions:
+        block = fly_block(
+            problem,
+            [mission.planner],
+            summary["seed"],
+            range(mission.run, mission.run + 1),
+            data_folder,
+            record_every=_planner_ticks(problem),
+        )
+        stored = (rows["planner"] == mission.planner) & (rows["run"] == mission.run)
+        for key, values in block.rows.items():
+            if not np.array_equal(values, rows[key][stored], equal_nan=values.dtype.kind == "f"):
+                raise DataError(
+                    f"run {mission.run} of {mission.planner} does not fly as it did: {key} = {values[0]}, stored "
+                    f"{rows[key][stored][0]}; results of another version cannot be drawn in full"
+                )
+        tracks.append(block.trajectories)
+
+    def obstacles_of(run: int) -> ObstacleSet:
+        return scenes_of(problem, summary["seed"], range(run, run + 1), data_folder)
+
+    name = str(summary["problem"])
+    return written + plot.paths_overview(problem, name, store.stack(tracks), obstacles_of, missions, out)
+
+
+def _planner_ticks(problem: Problem) -> int:
+    return round(problem.simulation.controller_rate_hz / problem.planner.rate_hz)
+
+
+def draw_stored(
+    folder: Path, out: Path, data_folder: Path | None = None, animated: bool = False
+) -> list[Path]:
+    """Draw stored results: of a single run its mission, of a campaign its comparison.
+
+    Raises
+    ------
+    DataError
+        If the folder holds no results of ours.
+    """
+    if not (folder / "summary.json").is_file():
+        raise DataError(
+            f"{folder}: holds no summary.json; give a folder that run, compare or montecarlo has written"
+        )
+    summary = store.read_json(folder / "summary.json")
+    scenario = store.read_json(folder / "scenario.json")
+    try:
+        problem = Problem.model_validate_json(store.to_json(scenario["problem"]))
+        name, planners = str(summary["problem"]), list(summary["planners"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{folder}: its files are not of this version: {str(error)[:300]}") from error
+    store.output_folder(out)
+    if "run" in summary:
+        trajectories = store.read_table(folder / "trajectories.parquet")
+        (shapes,) = read_scenes(folder / "scenario.json").values()
+        return draw_mission(
+            problem, name, trajectories, ObstacleSet.from_shapes(shapes), planners, out, animated
+        )
+    return draw_comparison(problem, summary, store.read_table(folder / "runs.parquet"), out, data_folder)

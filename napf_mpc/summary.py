@@ -1,0 +1,81 @@
+"""Tables of runs, and what is said of them: rates with intervals, quantiles, paired tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.evaluate import METRICS, Outcome, Score
+from napf_mpc.risk import Rate, clustered_rate, paired_tests, quantiles, wilson
+
+Columns = dict[str, NDArray[Any]]
+
+
+def score_rows(planner: str, seed: int, score: Score) -> Columns:
+    """Return one row a run: who, which run, how it ended, and its metrics."""
+    runs = len(score.runs)
+    return {
+        "planner": np.full(runs, planner),
+        "run": score.runs,
+        "seed": np.full(runs, seed, dtype=np.int64),
+        "outcome": np.array([str(outcome) for outcome in score.outcome]),
+        "finished": score.finished,
+        "obstacle_contact": score.obstacle_contact.any(-1),
+        "uav_contact": score.uav_contact,
+        "uavs_hit": score.obstacle_contact.sum(-1).astype(np.int64),
+        "uavs": np.full(runs, score.obstacle_contact.shape[1], dtype=np.int64),
+        "joint_success": score.joint_success,
+        **score.metrics,
+    }
+
+
+def summarise(rows: Columns, identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Summarise a table of runs: the layout of ``summary.json``.
+
+    Parameters
+    ----------
+    rows : dict of str to array
+        Columns of :func:`score_rows`; every planner has the same runs in the same order.
+    identity : mapping
+        Of :func:`napf_mpc.provenance.identity`.
+
+    Returns
+    -------
+    dict
+        Identity, then per planner counts, rates with 95 % intervals and quantiles, then paired tests.
+    """
+    parts = {
+        name: {key: values[rows["planner"] == name] for key, values in rows.items()}
+        for name in identity["planners"]
+    }
+    hits = {name: np.asarray(part["obstacle_contact"], dtype=bool) for name, part in parts.items()}
+    return {
+        **{key: identity[key] for key in ("problem", "problem_hash", "data", "seed", "versions")},
+        "planners": {name: _planner_summary(part) for name, part in parts.items()},
+        "paired": [asdict(pair) for pair in paired_tests(hits)],
+    }
+
+
+def _planner_summary(part: Columns) -> dict[str, Any]:
+    runs = len(part["run"])
+    outcomes = {str(outcome): int((part["outcome"] == str(outcome)).sum()) for outcome in Outcome}
+    return {
+        "runs": runs,
+        **outcomes,
+        **_bounds("collision_risk", wilson(int(part["obstacle_contact"].sum()), runs)),
+        **_bounds("uav_collision_risk", clustered_rate(part["uavs_hit"], int(part["uavs"][0]))),
+        **_bounds("uav_contact_risk", wilson(int(part["uav_contact"].sum()), runs)),
+        "finished": int(part["finished"].sum()) / runs,
+        "joint_success": int(part["joint_success"].sum()) / runs,
+        **{name: quantiles(np.asarray(part[name], dtype=float)) for name in METRICS},
+        # What a planner without a solver says; one with a solver fills it in.
+        "solver": {"status": {}, "iterations": None, "fall_backs": 0},
+    }
+
+
+def _bounds(name: str, rate: Rate) -> dict[str, float]:
+    return {name: rate.value, f"{name}_low": rate.low, f"{name}_high": rate.high}
