@@ -21,6 +21,7 @@ TAGS = ("kind", "shape")
 UNITS = {
     "_kgm2": "kg m²",
     "_kg": "kg",
+    "_mps2": "m/s²",
     "_mps": "m/s",
     "_m": "m",
     "_s": "s",

@@ -9,7 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from napf_mpc.campaign import Missions, compare, run_campaign, simulate
+    from napf_mpc.block import Missions, simulate
+    from napf_mpc.campaign import compare, run_campaign
     from napf_mpc.errors import DataError, NapfError, OutputError, ProblemError, SceneError
     from napf_mpc.navigation.solution import NavSolution
     from napf_mpc.planners.planner import Command, Planner
@@ -26,7 +27,7 @@ _HOMES = {
     "ApfPlanner": "planners.potential_field",
     "Command": "planners.planner",
     "DataError": "errors",
-    "Missions": "campaign",
+    "Missions": "block",
     "NapfError": "errors",
     "NapfPlanner": "planners.potential_field",
     "NavSolution": "navigation.solution",
@@ -41,7 +42,7 @@ _HOMES = {
     "load_problem": "problem_file",
     "lqr": "vehicle.lqr",
     "run_campaign": "campaign",
-    "simulate": "campaign",
+    "simulate": "block",
 }
 
 __all__ = [

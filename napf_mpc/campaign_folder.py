@@ -1,8 +1,8 @@
 """The folder of a campaign: whose it is, which blocks are finished, and the tables made of them.
 
-A finished block is a file ``blocks/rows_<first>_<stop>.parquet``, with ``timing_`` and ``trajectories_`` files
-of the same runs beside it. ``runs.parquet``, ``timing.parquet`` and ``summary.json`` are made from the blocks and
-can be made again.
+A finished block is a file ``blocks/rows_<first>_<stop>.parquet``, with ``timing_`` and ``trajectories_`` of
+the same runs beside it. ``runs.parquet``, ``timing.parquet`` and ``summary.json`` are made from the blocks,
+and made again whenever the command is repeated.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +120,7 @@ class Blocks:
                 self._check(path, runs)
                 found.append(runs)
         found.sort(key=lambda runs: (runs.start, runs.stop))
-        for before, after in zip(found, found[1:], strict=False):
+        for before, after in pairwise(found):
             if after.start < before.stop:
                 raise DataError(
                     f"{self.folder / f'rows_{_tag(after)}'}: holds runs that rows_{_tag(before)} holds too; "
@@ -181,7 +182,9 @@ def conclude(out: Path, blocks: Blocks, runs: int) -> dict[str, Any]:
     rows = store.stack(list(tables("rows")))
     for planner in planners:
         if not np.array_equal(rows["run"][rows["planner"] == planner], np.arange(runs)):
-            raise DataError(f"{blocks.folder}: does not hold every run of {planner} once; choose another --out")
+            raise DataError(
+                f"{blocks.folder}: not every run of {planner} is there once; choose another --out"
+            )
     store.write_table(out / "runs.parquet", rows)
     store.write_table(out / "timing.parquet", store.stack([blocks.table("timing", b) for b in finished]))
     if blocks.identity.get("record_every"):

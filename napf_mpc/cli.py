@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import functools
 import json
-import os
-import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
-from napf_mpc.errors import NapfError
+from napf_mpc import interrupts
+from napf_mpc.errors import DataError, NapfError
 
 if TYPE_CHECKING:
     from napf_mpc.problem import Problem
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="napf-mpc",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -45,7 +44,8 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Print errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on standard output.")]
 Runs = Annotated[int, typer.Option(help="Number of runs.")]
 Workers = Annotated[int | None, typer.Option(help="Processes (default: one a core). Changes no result.")]
-Planners = Annotated[str, typer.Option(help="Planners, with commas.")]
+Planner = Annotated[str | None, typer.Option(help="apf or napf (default: the problem's own).")]
+Animation = Annotated[bool, typer.Option("--animation", help="Draw an animation too: some ten seconds.")]
 
 
 F = TypeVar("F", bound=Callable[..., None])
@@ -65,10 +65,11 @@ def run_command(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments : sequence of str, optional
-        Instead of those that the process was started with.
+        Instead of those that the process was started with; none at all asks for help.
     """
+    given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        return int(app(arguments, prog_name="napf-mpc", standalone_mode=False) or 0)
+        return int(app(given or ["--help"], prog_name="napf-mpc", standalone_mode=False) or 0)
     except _UsageError as error:
         _complain(error.format_message())
     except NapfError as error:
@@ -108,23 +109,24 @@ def _name(file: str) -> str:
     return Path(file).stem
 
 
-def _show(table: Rows, quiet: bool) -> None:
-    if quiet:
-        return
-    from rich.console import Console
-
-    table.print(Console())
-
-
 def _say(text: str, quiet: bool) -> None:
     if not quiet:
         print(text)
 
 
-def _workers(workers: int | None) -> int:
-    if workers is not None:
-        return workers
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _show(table: Rows, quiet: bool) -> None:
+    if quiet:
+        return
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=120)  # a file has no width, and 80 columns would cut labels in two
+    table.print(console)
+
+
+def _print_json(value: Any) -> None:
+    print(json.dumps(value, indent=2, allow_nan=False))
 
 
 @_command
@@ -137,13 +139,13 @@ def problems(
     from napf_mpc.shipped import shipped_problems
 
     if schema:
-        print(json.dumps(problem_schema(), indent=2))
+        _print_json(problem_schema())
         return
     listed = [(name, load_problem(path).title) for name, path in shipped_problems().items()]
     if as_json:
-        print(json.dumps([{"name": name, "title": title} for name, title in listed], indent=2))
+        _print_json([{"name": name, "title": title} for name, title in listed])
         return
-    width = max(len(name) for name, _ in listed)
+    width = max((len(name) for name, _ in listed), default=0)
     for name, title in listed:
         print(f"{name:<{width}}  {title}")
 
@@ -155,66 +157,60 @@ def validate(
     """Check a problem file: every error with key, value and what is allowed."""
     problem = _problem(file, settings)
     from napf_mpc.campaign import check_flyable
-    from napf_mpc.planners.registry import make_planner
     from napf_mpc.problem import FormationMission
+    from napf_mpc.scenario_file import scenes_of
 
     note = ""
-    if isinstance(problem.mission, FormationMission):
-        make_planner(problem.planner.kind, problem)
-        try:
+    try:
+        if isinstance(problem.mission, FormationMission):
             check_flyable(problem, [problem.planner.kind], data_folder=data)
-        except _missing_data() as error:
-            note = f"not flown through: {error}"
+        else:
+            scenes_of(problem, data_folder=data)
+    except DataError as error:
+        note = f"its data could not be used: {error}"
     if as_json:
-        print(json.dumps({"file": file, "valid": True, "problem_hash": problem.digest(), "note": note}))
+        _print_json({"file": file, "valid": True, "problem_hash": problem.digest(), "note": note})
         return
     _say(f"{file}: valid", quiet)
     if note:
         _say(note, quiet)
 
 
-def _missing_data() -> type[NapfError]:
-    from napf_mpc.errors import DataError
-
-    return DataError
-
-
 @_command
 def run(
     file: File,
-    planner: Annotated[str | None, typer.Option(help="apf or napf (default: the problem's own).")] = None,
+    planner: Planner = None,
     seed: Seed = 0,
     run_index: Annotated[int, typer.Option(help="Which run of the seed's campaign.")] = 0,
     out: Out = None,
+    animation: Animation = False,
     settings: Settings = None,
     data: Data = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Fly one mission: metrics, and with --out trajectories and figures. Exit code 1 if it is not reached."""
-    problem = _problem(file, settings)
-    from napf_mpc import mission
+    problem, name = _problem(file, settings), _name(file)
+    kind = problem.planner.kind if planner is None else planner
+    from napf_mpc.mission import fly_mission
 
-    row = mission.fly_one(
-        problem, _name(file), planner or problem.planner.kind, seed, run_index, out, data_folder=data
-    )
-    if as_json:
-        print(json.dumps(row.summary, indent=2))
-    elif not quiet:
-        _show(row.table, quiet)
-        _say_out(out, quiet)
-    raise typer.Exit(0 if row.reached else 1)
+    flown = fly_mission(problem, name, kind, seed=seed, run=run_index, out=out, data_folder=data)
+    if not as_json:
+        from napf_mpc.report import mission_table
 
-
-def _say_out(out: Path | None, quiet: bool) -> None:
+        _show(mission_table(flown.row, name), quiet)
     if out is not None:
-        _say(f"results and figures: {out}", quiet)
+        from napf_mpc.figures import draw_mission
+
+        draw_mission(problem, name, flown.trajectories, flown.obstacles, [kind], out, animation)
+    _end(flown.summary, out, quiet, as_json)
+    raise typer.Exit(0 if flown.reached else 1)
 
 
 @_command
 def compare(
     file: File,
-    planners: Planners = "apf,napf",
+    planners: Annotated[str, typer.Option(help="Planners, with commas.")] = "apf,napf",
     runs: Runs = 30,
     seed: Seed = 0,
     workers: Workers = None,
@@ -225,17 +221,15 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Fly planners on the same seeds and compare them: the paper's Table 1 for any problem."""
-    problem = _problem(file, settings)
     names = [name.strip() for name in planners.split(",") if name.strip()]
-    summary = _campaign(problem, file, names, runs, seed, workers, out, 0, data, quiet or as_json)
-    _conclude(problem, summary, out, quiet, as_json)
+    _campaign(_problem(file, settings), file, names, runs, seed, workers, out, data, quiet, as_json)
 
 
 @_command
 def montecarlo(
     file: File,
     out: OutNeeded,
-    planner: Annotated[str | None, typer.Option(help="apf or napf (default: the problem's own).")] = None,
+    planner: Planner = None,
     runs: Runs = 1000,
     seed: Seed = 0,
     workers: Workers = None,
@@ -249,11 +243,9 @@ def montecarlo(
 ) -> None:
     """Fly many missions of one planner; repeat the command to go on where it stopped."""
     problem = _problem(file, settings)
-    ratio = round(problem.simulation.controller_rate_hz / problem.planner.rate_hz)
-    every = ratio if trajectories else 0
-    names = [planner or problem.planner.kind]
-    summary = _campaign(problem, file, names, runs, seed, workers, out, every, data, quiet or as_json)
-    _conclude(problem, summary, out, quiet, as_json)
+    ticks = round(problem.simulation.controller_rate_hz / problem.planner.rate_hz) if trajectories else 0
+    names = [problem.planner.kind if planner is None else planner]
+    _campaign(problem, file, names, runs, seed, workers, out, data, quiet, as_json, ticks)
 
 
 @_command
@@ -261,20 +253,24 @@ def figures(
     source: Annotated[str, typer.Argument(metavar="FILE_OR_DIR", help="Problem, or folder with results.")],
     out: OutNeeded,
     seed: Seed = 0,
+    animation: Animation = False,
     settings: Settings = None,
     data: Data = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Draw the paper's figures for a problem, or the figures of stored results."""
-    from napf_mpc import mission
-
     if Path(source).is_dir():
-        paths = mission.draw_stored(Path(source), out)
+        from napf_mpc.figures import draw_stored
+
+        paths = draw_stored(Path(source), out, data, animation)
     else:
-        paths = mission.draw_problem(_problem(source, settings), _name(source), seed, out, data)
+        problem = _problem(source, settings)
+        from napf_mpc.figures import draw_problem
+
+        paths = draw_problem(problem, _name(source), seed, out, data)
     if as_json:
-        print(json.dumps([str(path) for path in paths], indent=2))
+        _print_json([str(path) for path in paths])
         return
     for path in paths:
         _say(str(path), quiet)
@@ -288,44 +284,69 @@ def _campaign(
     seed: int,
     workers: int | None,
     out: Path | None,
-    record_every: int,
     data: Path | None,
-    silent: bool,
-) -> dict[str, Any]:
+    quiet: bool,
+    as_json: bool,
+    record_every: int = 0,
+) -> None:
     from contextlib import ExitStack
     from tempfile import TemporaryDirectory
 
+    from napf_mpc.campaign import run_campaign
+
+    with ExitStack() as stack:
+        kept = out or Path(stack.enter_context(TemporaryDirectory(prefix="napf-mpc-")))
+        tell = stack.enter_context(_progress(runs, quiet or as_json))
+
+        def progress(done: int) -> None:
+            tell(done)
+            kept_runs = f"{done} of {runs} runs are kept in {out}; repeat the command to go on"
+            interrupts.when_stopped(
+                f"stopped: {'nothing is kept without --out' if out is None else kept_runs}"
+            )
+
+        summary = run_campaign(
+            problem, names, runs, seed, kept, name=_name(file), workers=_processes(workers),
+            data_folder=data, record_every=record_every, progress=progress,
+        )  # fmt: skip
+    from napf_mpc.report import comparison
+
+    table = comparison(summary, problem.reference)
+    if not as_json:
+        _show(table, quiet)
+    if out is not None:
+        from napf_mpc import store
+        from napf_mpc.figures import draw_comparison
+
+        store.write_bytes(out / "comparison.md", lambda file: file.write(table.markdown().encode()))
+        draw_comparison(problem, summary, store.read_table(out / "runs.parquet"), out, data)
+    _end(summary, out, quiet, as_json)
+
+
+@contextmanager
+def _progress(runs: int, silent: bool) -> Iterator[Callable[[int], None]]:
+    """Progress bar on a terminal, nothing anywhere else."""
+    if silent or not sys.stderr.isatty():
+        yield lambda done: None
+        return
     from rich.console import Console
     from rich.progress import Progress
 
-    from napf_mpc.campaign import run_campaign
-
-    console = Console(stderr=True)
-    with ExitStack() as stack:
-        folder = out if out is not None else Path(stack.enter_context(TemporaryDirectory(prefix="napf-mpc-")))
-        bar = stack.enter_context(
-            Progress(console=console, transient=True, disable=silent or not console.is_terminal)
-        )
+    with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("missions", total=runs)
-        return run_campaign(
-            problem, names, runs, seed, folder, name=_name(file), workers=_workers(workers), data_folder=data,
-            record_every=record_every, progress=lambda done: bar.update(task, completed=done),
-        )  # fmt: skip
+        yield lambda done: bar.update(task, completed=done)
 
 
-def _conclude(
-    problem: Problem, summary: dict[str, Any], out: Path | None, quiet: bool, as_json: bool
-) -> None:
-    from napf_mpc import report
+def _processes(workers: int | None) -> int:
+    if workers is not None:
+        return workers
+    from joblib import cpu_count  # knows the limits of containers
 
-    table = report.comparison(summary, problem.reference)
-    if out is not None:
-        from napf_mpc import mission, store
+    return int(cpu_count())
 
-        store.write_bytes(out / "comparison.md", lambda file: file.write(table.markdown().encode()))
-        mission.draw_comparison(summary, out, problem)
+
+def _end(summary: dict[str, Any], out: Path | None, quiet: bool, as_json: bool) -> None:
     if as_json:
-        print(json.dumps(summary, indent=2))
-        return
-    _show(table, quiet)
-    _say_out(out, quiet)
+        _print_json(summary)
+    elif out is not None:
+        _say(f"results and figures: {out}", quiet)

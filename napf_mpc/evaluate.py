@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.jit import compiled
+from napf_mpc.navigation.consistency import normalised_errors
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.planner import Command
 from napf_mpc.problem import Problem
-from napf_mpc.simulate import POSITION, Flight, Mask, Scenario, formation_mission
+from napf_mpc.simulate import POSITION, VELOCITY, Flight, Mask, Scenario, formation_mission
 from napf_mpc.vehicle.quadrotor import hover_input
-from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
+from napf_mpc.world.distance import COS, SIN, Solids, X, Y, solid_bounds
 from napf_mpc.world.sweep import SweptClearance, swept_separation
 
 Array = NDArray[np.float64]
@@ -27,6 +28,8 @@ APART_S = 5.0
 """Separation counts from here on: the paper's take-off places are 1.4 m apart."""
 REFORMED_S = 1.0
 """A formation is re-formed once its shape error has stayed under the bound for this long."""
+CONSISTENCY_EVERY_S = 0.2
+"""How often the filter's errors are compared with its covariance; they change over seconds."""
 
 
 class Outcome(StrEnum):
@@ -50,6 +53,9 @@ METRICS = (
     "finish_time_s",
     "min_clearance_m",
     "min_separation_m",
+    "nees",
+    "nees_position",
+    "gated_fixes",
 )
 """Metrics of a run, in the order of every table."""
 
@@ -102,22 +108,25 @@ class MissionScore:
         self._passed_at = np.full(runs, np.nan)
         self._reform_time = np.full(runs, np.nan)
         self._last_obstacle = self._last_obstacle_along()
+        self._filtered = problem.navigation.filter != "none"
+        self._consistency_sums = np.zeros((runs, 3))
+        self._ticks = 0
 
     def _last_obstacle_along(self) -> Array:
         """Along-track place (run,) where the last obstacle in the formation's corridor ends; NaN if none."""
         obstacles, runs = self._scenario.obstacles, len(self._scenario.runs)
         length, reach = formation_mission(self._problem).length_m, self._problem.planner.influence_m
-        half_width = float(np.abs(self._offsets[:, 1]).max()) + reach
-        places = self._offsets * np.array([0.0, 0.0, 1.0])
-        heights = self._frame.to_world(np.concatenate([places, places + np.array([length, 0.0, 0.0])]))[:, 2]
+        ends_of_path = np.array([[(0.0, 0.0, 0.0)], [(length, 0.0, 0.0)]])
+        slots = ends_of_path + self._offsets * np.array([0.0, 1.0, 1.0])
+        heights = self._frame.to_world(slots)[..., 2]
+        half_width = np.abs(self._offsets[:, 1]).max()
+        low, high = _seen_from_path(obstacles.solids, self._frame)
+        met = (low[:, 0] <= length) & (high[:, 0] >= 0.0)
+        met &= (low[:, 1] <= half_width + reach) & (high[:, 1] >= -half_width - reach)
+        met &= (low[:, 2] <= heights.max() + reach) & (high[:, 2] >= heights.min() - reach)
+        scene = np.repeat(np.arange(obstacles.n_scenes), obstacles.counts())
         ends = np.full(obstacles.n_scenes, np.nan)
-        for scene in range(obstacles.n_scenes):
-            for shape in obstacles.shapes(scene):
-                near, far, right, left, base, top = _plan_extent(shape, self._frame)
-                beside = right > half_width or left < -half_width
-                above_or_below = base > heights.max() + reach or top < heights.min() - reach
-                if not (beside or above_or_below or near > length or far < 0.0):
-                    ends[scene] = np.fmax(ends[scene], far)
+        np.fmax.at(ends, scene[met], high[met, 0])
         return np.broadcast_to(ends, runs).copy()
 
     def moved(self, time_s: float, before: Array, after: Array, active: Mask) -> None:
@@ -155,6 +164,19 @@ class MissionScore:
             self._passed_at,
             self._reform_time,
         )
+        every = max(1, round(CONSISTENCY_EVERY_S * self._problem.simulation.controller_rate_hz))
+        if self._filtered and self._ticks % every == 0:
+            self._compare_with_covariance(state, nav, active)
+        self._ticks += 1
+
+    def _compare_with_covariance(self, state: Array, nav: NavSolution, active: Mask) -> None:
+        error = np.concatenate(
+            [nav.position - state[..., POSITION], nav.velocity - state[..., VELOCITY]], axis=-1
+        )
+        position, whole = np.empty(error.shape[:2]), np.empty(error.shape[:2])
+        normalised_errors(error, nav.covariance, position, whole)
+        now = np.stack([np.ones_like(active, dtype=float), whole.mean(-1), position.mean(-1)], axis=-1)
+        self._consistency_sums += np.where(active[:, None], now, 0.0)
 
     def score(self, flight: Flight) -> Score:
         """Verdicts and metrics once the block has flown."""
@@ -178,6 +200,8 @@ class MissionScore:
             )
         )
         counted = self._sums[:, _COUNT]
+        compared, whole, position = self._consistency_sums.T
+        gated = np.full(len(counted), np.nan) if flight.gated_fixes is None else flight.gated_fixes
         with np.errstate(invalid="ignore", divide="ignore"):
             progress = (self._end - self._start).mean(-1)
             metrics = {
@@ -190,6 +214,9 @@ class MissionScore:
                 "finish_time_s": flight.finish_time_s.copy(),
                 "min_clearance_m": _finite_or_nan(self._clearance.clearance.min(-1) - vehicle.radius_m),
                 "min_separation_m": _finite_or_nan(separation),
+                "nees": whole / compared,
+                "nees_position": position / compared,
+                "gated_fixes": gated.astype(np.float64),
             }
         for values in metrics.values():
             values[flight.failed] = np.nan
@@ -205,34 +232,21 @@ class MissionScore:
         )
 
 
-def _plan_extent(shape: Shape, frame: PathFrame) -> tuple[float, float, float, float, float, float]:
-    """Where a solid lies beside a path: near and far end along it, right, left [m]; height of base and top.
+def _seen_from_path(solids: Solids, frame: PathFrame) -> tuple[Array, Array]:
+    """Box of each solid in the frame of a path: lower and upper end along, to the left, and height [m].
 
     Seen from above: where the path climbs, the ends are those of its points over the solid.
     """
-    radius = 0.0
-    match shape:
-        case Sphere():
-            outline, radius = np.array([shape.centre_m[:2]]), shape.radius_m
-            base, top = shape.centre_m[2] - radius, shape.centre_m[2] + radius
-        case Cylinder():
-            outline, radius = np.array([shape.centre_m]), shape.radius_m
-            base, top = shape.base_m, shape.top_m
-        case Box():
-            x, y, z = shape.centre_m
-            half = 0.5 * np.array(shape.size_m)
-            c, s = math.cos(shape.heading_rad), math.sin(shape.heading_rad)
-            corners = half[:2] * np.array([(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)])
-            outline = corners @ np.array([(c, s), (-s, c)]) + np.array([x, y])
-            base, top = z - half[2], z + half[2]
-        case Prism():
-            outline, base, top = np.concatenate(shape.rings), shape.base_m, shape.top_m
-    offset = outline - frame.origin[:2]
-    lateral = offset[:, 0] * frame.left[0] + offset[:, 1] * frame.left[1]
-    ahead = offset[:, 0] * frame.left[1] - offset[:, 1] * frame.left[0]
-    slope = math.hypot(frame.along[0], frame.along[1])
-    near, far = (ahead.min() - radius) / slope, (ahead.max() + radius) / slope
-    return near, far, lateral.min() - radius, lateral.max() + radius, base, top
+    east, north = frame.left[1], -frame.left[0]
+    rows, slope = solids.parameters.copy(), math.hypot(frame.along[0], frame.along[1])
+    x, y = solids.parameters[:, X] - frame.origin[0], solids.parameters[:, Y] - frame.origin[1]
+    rows[:, X], rows[:, Y] = x * east + y * north, y * east - x * north
+    c, s = solids.parameters[:, COS], solids.parameters[:, SIN]
+    rows[:, COS], rows[:, SIN] = c * east + s * north, s * east - c * north
+    x, y = solids.vertices[:, 0] - frame.origin[0], solids.vertices[:, 1] - frame.origin[1]
+    vertices = np.column_stack([x * east + y * north, y * east - x * north])
+    low, high = solid_bounds(solids._replace(parameters=rows, vertices=vertices))
+    return low / (slope, 1.0, 1.0), high / (slope, 1.0, 1.0)
 
 
 def _finite_or_nan(values: Array) -> Array:

@@ -103,8 +103,8 @@ def draw_comparison(
         for key, values in block.rows.items():
             if not np.array_equal(values, rows[key][stored], equal_nan=values.dtype.kind == "f"):
                 raise DataError(
-                    f"run {mission.run} of {mission.planner} does not fly as it did: {key} = {values[0]}, stored "
-                    f"{rows[key][stored][0]}; results of another version cannot be drawn in full"
+                    f"run {mission.run} of {mission.planner} does not fly as it did: {key} = {values[0]}, "
+                    f"stored {rows[key][stored][0]}; results of another version cannot be drawn in full"
                 )
         tracks.append(block.trajectories)
 

@@ -17,6 +17,7 @@ from napf_mpc.formation import PathFrame
 from napf_mpc.problem import GoalMission, Problem
 from napf_mpc.store import Columns
 from napf_mpc.summary import score_rows
+from napf_mpc.words import shown_text
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.scenes import build_scenes
 from napf_mpc.world.sweep import SweptClearance
@@ -88,7 +89,7 @@ def walk_block(problem: Problem, planner: str, seed: int, run: int, obstacles: O
     """
     goal_mission(problem)
     if planner != "apf":
-        raise ProblemError("planner", [f'"{planner}" cannot walk to a goal; missions of kind goal need "apf"'])
+        raise ProblemError("planner", [f'"{shown_text(planner)}" cannot walk to a goal; only "apf" can'])
     began = time.perf_counter()
     walk = walk_to_goal(problem, obstacles)
     timing = timing_row(planner, range(run, run + 1), time.perf_counter() - began)

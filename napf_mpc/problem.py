@@ -489,14 +489,21 @@ class _NavigationBase(_Section):
     reported_sigma_scale: float = Field(1.0, ge=1e-3, le=1e3)
     """What navigation claims over the truth: 0.5 reports half the true sigma."""
     error_scale: float = Field(1.0, ge=0.0, le=100.0)
-    """Factor on the errors themselves; the reported sigma does not follow it. 0 switches the noise off."""
-
-    @field_validator("filter")
-    @classmethod
-    def _filter_exists(cls, value: str) -> str:
-        if value == "kalman":
-            raise ValueError('"kalman" is not built in this version; use "none"')
-        return value
+    """Factor on the errors themselves; what is reported does not follow it. 0 switches the noise off."""
+    gnss_velocity_sigma_mps: float = Field(0.1, ge=1e-4, le=100.0)
+    """Filter: sigma of the GNSS velocity, white, with each fix."""
+    accelerometer_bias_mps2: float = Field(0.05, ge=0.0, le=10.0)
+    """Filter: sigma of an accelerometer's bias on each axis [m/s^2]."""
+    accelerometer_bias_time_s: float = Field(100.0, ge=0.1, le=1e6)
+    """Filter: correlation time of that bias."""
+    accelerometer_noise_mps_rts: float = Field(0.01, ge=1e-6, le=10.0)
+    """Filter: white noise of an accelerometer, as sigma of the velocity after one second [m/s/√s]."""
+    innovation_gate_sigma: float = Field(5.0, ge=0.0, le=100.0)
+    """Filter: a fix farther than this many sigmas from what is expected is refused; 0 for no gate."""
+    filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
+    """Filter: correlation time that it assumes of the fix's error; by default the error's own."""
+    filter_coast_sigma_m: float = Field(10.0, ge=1e-3, le=1e4)
+    """Filter: without a fix, the solution counts as available up to this sigma of an axis."""
 
 
 class GaussMarkov(_NavigationBase):
@@ -562,6 +569,8 @@ class Recorded(_NavigationBase):
     """Sigma of the barometer's height."""
     barometer_correlation_time_s: float = Field(300.0, ge=0.0, le=1e6)
     """Correlation time of the barometer's error."""
+    filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] = 3.0
+    """Filter: correlation time that it assumes of the log's errors (the barometer's is its own)."""
     credit: str = Field("", max_length=500)
     """Source and licence, printed on every figure."""
 

@@ -1,4 +1,4 @@
-"""What decides a result: problem, data, seed, planners and code. Results of another origin are never mixed in."""
+"""What decides a result: problem, data, seed, planners and code. Results of two origins are never mixed."""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from napf_mpc.evaluate import Outcome
 from napf_mpc.problem import Reference
@@ -47,11 +48,12 @@ class Rows:
 
     def print(self, console: Console) -> None:
         """Print the table on a terminal."""
-        table = Table(title=self.title, title_justify="left")
+        # Text, not str: rich would take the unit in "path RMS [m]" for markup and leave it out.
+        table = Table(title=Text(self.title), title_justify="left")
         for i, name in enumerate(self.header):
-            table.add_column(name, justify="left" if i == 0 else "right", no_wrap=i > 0)
+            table.add_column(Text(name), justify="left" if i == 0 else "right")
         for row in self.rows:
-            table.add_row(*row)
+            table.add_row(*(Text(cell) for cell in row))
         console.print(table)
         for note in self.notes:
             console.print(note, markup=False, highlight=False)
@@ -61,9 +63,8 @@ def comparison(summary: dict[str, Any], reference: Reference | None = None) -> R
     """Table 1 for any problem: planners side by side, every rate with k, n and interval."""
     planners: dict[str, dict[str, Any]] = summary["planners"]
     runs = next(iter(planners.values()))["runs"]
-    rows = [
-        ("collision risk, any UAV and obstacle", *[_rate(p, "collision_risk") for p in planners.values()])
-    ]
+    each = planners.values()
+    rows = [("collision risk, any UAV and obstacle", *[_rate(p, "collision_risk") for p in each])]
     if reference is not None:
         published: dict[str, float] = dict(reference.collision_risk)  # type: ignore[arg-type]
         cells = []
@@ -71,17 +72,18 @@ def comparison(summary: dict[str, Any], reference: Reference | None = None) -> R
             value = published.get(name)
             cells.append("" if value is None else f"{100 * value:.2f} % (n = {reference.runs})")
         rows.append((f"  {reference.source}", *cells))
-    rows.append(("  of one UAV", *[_rate(p, "uav_collision_risk") for p in planners.values()]))
-    rows.append(("UAV-UAV contact", *[_rate(p, "uav_contact_risk") for p in planners.values()]))
+    rows.append(("  of one UAV", *[_rate(p, "uav_collision_risk", p["uavs"]) for p in each]))
+    rows.append(("UAV-UAV contact", *[_rate(p, "uav_contact_risk") for p in each]))
     for outcome in Outcome:
-        rows.append((f"{outcome}", *[f"{p[str(outcome)]} of {p['runs']}" for p in planners.values()]))
+        rows.append((f"{outcome}", *[f"{p[str(outcome)]} of {p['runs']}" for p in each]))
     for key, label in (("finished", "finished, contacts or not"), ("joint_success", "joint success")):
-        rows.append((label, *[_fraction(p[key], p["runs"]) for p in planners.values()]))
+        rows.append((label, *[_fraction(p[key], p["runs"]) for p in each]))
     for key, label in METRIC_LABELS.items():
-        rows.append((label, *[_quantiles(p[key]) for p in planners.values()]))
+        rows.append((label, *[_quantiles(p[key], p["runs"]) for p in each]))
     notes = [
         f"N = {runs} runs a planner, seed {summary['seed']}, the same scenes and errors for all.",
-        "In brackets: 95 % intervals (Wilson; of one UAV: allowing for shared fates); metrics: 5 and 95 %.",
+        "Rates: count / missions = rate [95 % interval] (Wilson; of one UAV: allowing for shared fates). "
+        "Metrics: median [5 %, 95 %] of the missions for which they are defined.",
         "joint success: reached, no contact of either kind, re-formed after the last obstacle.",
     ]
     notes += [_pair(pair) for pair in summary["paired"]]
@@ -90,20 +92,26 @@ def comparison(summary: dict[str, Any], reference: Reference | None = None) -> R
     return Rows(str(summary["problem"]), ("", *planners), tuple(rows), tuple(notes))
 
 
-def _rate(planner: dict[str, Any], key: str) -> str:
-    low, high = 100 * planner[f"{key}_low"], 100 * planner[f"{key}_high"]
-    return f"{100 * planner[key]:.2f} % [{low:.2f}, {high:.2f}]"
+def _rate(planner: dict[str, Any], key: str, uavs: int = 1) -> str:
+    missions = planner["runs"] * uavs
+    return _counted(planner[key], missions, planner[f"{key}_low"], planner[f"{key}_high"])
 
 
 def _fraction(value: float, runs: int) -> str:
     rate = wilson(round(value * runs), runs)
-    return f"{100 * value:.1f} % [{100 * rate.low:.1f}, {100 * rate.high:.1f}]"
+    return _counted(value, runs, rate.low, rate.high)
 
 
-def _quantiles(q: dict[str, Any]) -> str:
+def _counted(value: float, missions: int, low: float, high: float) -> str:
+    share = f"{100 * value:.2f} % [{100 * low:.2f}, {100 * high:.2f}]"
+    return f"{round(value * missions)} / {missions} = {share}"
+
+
+def _quantiles(q: dict[str, Any], runs: int) -> str:
     if not q["n"]:
         return "not defined"
-    return f"{q['median']:.2f} [{q['p05']:.2f}, {q['p95']:.2f}]"
+    missions = "" if q["n"] == runs else f", n = {q['n']}"
+    return f"{q['median']:.2f} [{q['p05']:.2f}, {q['p95']:.2f}]{missions}"
 
 
 def _pair(pair: dict[str, Any]) -> str:

@@ -125,7 +125,7 @@ def write_scenario(
 
 
 def _start(problem: Problem) -> Array:
-    """State at the start (uav, 12), the same for every run (Eq. 1); a walking point has a place only (1, 3)."""
+    """State at the start (uav, 12), the same for every run (Eq. 1); a walking point has a place only."""
     if isinstance(problem.mission, FormationMission):
         return initial_state(problem)
     return np.array([[*problem.mission.start_m, 0.0]])
@@ -162,7 +162,8 @@ def read_scenes(path: Path) -> dict[int | None, list[Shape]]:
     table = store.read_json(path)
     try:
         return {
-            scene["run"]: [shape_from_json(shape) for shape in scene["obstacles"]] for scene in table["scenes"]
+            scene["run"]: [shape_from_json(shape) for shape in scene["obstacles"]]
+            for scene in table["scenes"]
         }
     except (KeyError, TypeError) as error:
         raise DataError(f"{path}: not a scenario of ours: {error!r}") from error

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.navigation.error_models import Fix, PositionErrors, position_errors
+from napf_mpc.navigation.filtered import FilteredNavigation
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.planner import Command, Planner
 from napf_mpc.problem import FormationMission, Problem
@@ -136,6 +137,8 @@ class Flight:
     """(run,) when the last UAV passed the mission's length; NaN if it did not [s]."""
     duration_s: Array
     """(run,) time flown [s]."""
+    gated_fixes: NDArray[np.int64] | None = None
+    """(run,) position fixes that the navigation filter refused; None without a filter."""
 
 
 def closed_loop(
@@ -173,15 +176,27 @@ def closed_loop(
     finish_time = np.full(runs, np.nan)
     duration = np.zeros(runs)
     planner.reset(scenario.obstacles, runs)
+    filtered = _filtered(problem, scenario, clock)
     fix = scenario.errors.fix(0)
     covariance = _with_velocity(fix.covariance)
     command: Command | None = None
     for tick in range(clock.ticks):
         time_s = tick * clock.period_s
-        if tick % clock.ticks_per_fix == 0:
-            fix = scenario.errors.fix(tick // clock.ticks_per_fix)
-            covariance = _with_velocity(fix.covariance)
-        nav = _solution(time_s, state, fix, covariance)
+        if filtered is not None:
+            nav = filtered.solution(
+                tick,
+                time_s,
+                state[..., POSITION],
+                state[..., VELOCITY],
+                state[..., ATTITUDE],
+                state[..., RATES],
+                active,
+            )
+        else:
+            if tick % clock.ticks_per_fix == 0:
+                fix = scenario.errors.fix(tick // clock.ticks_per_fix)
+                covariance = _with_velocity(fix.covariance)
+            nav = _solution(time_s, state, fix, covariance)
         if command is None or tick % clock.ticks_per_plan == 0:
             command = planner.step(nav, time_s)
             holding[active] = command.holding[active].any(-1)
@@ -212,7 +227,14 @@ def closed_loop(
         if not active.any():
             break
     duration[active] = clock.ticks * clock.period_s
-    return Flight(np.isfinite(finish_time), failed, holding, finish_time, duration)
+    return Flight(
+        np.isfinite(finish_time),
+        failed,
+        holding,
+        finish_time,
+        duration,
+        None if filtered is None else filtered.gated_fixes,
+    )
 
 
 @dataclass(frozen=True)
@@ -238,6 +260,20 @@ class _Clock:
             ticks_per_fix=round(fix_period_s / period),
             ticks=max(1, math.ceil(simulation.time_limit_s / period - 1e-9)),
         )
+
+
+def _filtered(problem: Problem, scenario: Scenario, clock: _Clock) -> FilteredNavigation | None:
+    if problem.navigation.filter == "none":
+        return None
+    return FilteredNavigation(
+        problem.navigation,
+        scenario.errors,
+        scenario.seed,
+        scenario.runs,
+        clock.period_s,
+        clock.ticks_per_fix,
+        scenario.initial_state[..., VELOCITY],
+    )
 
 
 def _with_velocity(covariance: Array) -> Array:

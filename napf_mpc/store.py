@@ -196,7 +196,9 @@ def output_folder(path: Path) -> Path:
         raise OutputError(f"{path}: is a file, not a folder; choose another --out") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         reason = getattr(error, "strerror", None) or error
-        raise OutputError(f"{path}: cannot be used as output folder: {reason}; choose another --out") from error
+        raise OutputError(
+            f"{path}: cannot be a folder for results: {reason}; choose another --out"
+        ) from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise OutputError(f"{path}: is not writable; choose another --out")
     return path

@@ -22,6 +22,9 @@ class Stream(IntEnum):
     OUTAGE = 4
     BAROMETER = 5
     RECORD_OFFSET = 6
+    GNSS_VELOCITY = 7
+    ACCELEROMETER_BIAS = 8
+    ACCELEROMETER_NOISE = 9
 
 
 def generator(seed: int, run: int, stream: Stream, uav: int = 0, axis: int = 0) -> np.random.Generator:
@@ -59,3 +62,51 @@ def uniforms(seed: int, runs: range, stream: Stream, uavs: int, axes: int, count
             for axis in range(axes):
                 generator(seed, run, stream, uav, axis).random(out=out[r, uav, axis])
     return out
+
+
+class NormalSequence:
+    """Standard-normal numbers of many streams, one array (run, uav, axis) a step, without holding them all.
+
+    Each stream keeps its generator and is drawn some steps ahead. The numbers are those of :func:`normals`,
+    whatever ``ahead`` is.
+
+    Parameters
+    ----------
+    seed : int
+        Campaign seed.
+    runs : range
+        Indices of the runs.
+    stream : Stream
+        What the numbers are for.
+    uavs, axes : int
+        How many.
+    ahead : int
+        Steps drawn at once: few cost time, many cost memory (8 bytes a number).
+    """
+
+    def __init__(
+        self, seed: int, runs: range, stream: Stream, uavs: int, axes: int = 3, ahead: int = 256
+    ) -> None:
+        self._generators = [
+            generator(seed, run, stream, uav, axis)
+            for run in runs
+            for uav in range(uavs)
+            for axis in range(axes)
+        ]
+        self._series = np.empty((len(self._generators), ahead))
+        self._steps = np.empty((ahead, len(self._generators)))
+        self._shape = (len(runs), uavs, axes)
+        self._next = ahead
+
+    def take(self) -> NDArray[np.float64]:
+        """Return the numbers of the next step, shape (run, uav, axis); not to be kept beyond the next call."""
+        if self._next == len(self._steps):
+            for numbers, source in zip(self._series, self._generators, strict=True):
+                source.standard_normal(out=numbers)
+            # A step is read at once, so its numbers are brought together; in bands, which is kinder to caches.
+            for first in range(0, len(self._series), 64):
+                self._steps[:, first : first + 64] = self._series[first : first + 64].T
+            self._next = 0
+        step: NDArray[np.float64] = self._steps[self._next].reshape(self._shape)
+        self._next += 1
+        return step

@@ -65,6 +65,7 @@ def _planner_summary(part: Columns) -> dict[str, Any]:
     outcomes = {str(outcome): int((part["outcome"] == str(outcome)).sum()) for outcome in Outcome}
     return {
         "runs": runs,
+        "uavs": int(part["uavs"][0]),
         **outcomes,
         **_bounds("collision_risk", wilson(int(part["obstacle_contact"].sum()), runs)),
         **_bounds("uav_collision_risk", clustered_rate(part["uavs_hit"], int(part["uavs"][0]))),

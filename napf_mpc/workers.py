@@ -1,4 +1,4 @@
-"""Blocks of runs over processes of this machine: none outlives us, and one that dies costs only its blocks."""
+"""Blocks of runs over processes of this machine: none outlives us, and one that dies costs only its block."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
 
@@ -22,7 +22,7 @@ _WATCH_S = 0.5
 
 def in_workers(
     task: Callable[[range], T], blocks: Sequence[range], workers: int
-) -> Iterator[tuple[range, T]]:
+) -> Generator[tuple[range, T], None, None]:
     """Do a task for every block, over several processes if that is wanted; blocks come as they finish.
 
     Workers do not see Ctrl-C: the terminal sends it to all, but only this process knows what to keep. They
@@ -64,8 +64,8 @@ def in_workers(
             if deaths == MAX_DEATHS:
                 first = next(iter(left))
                 raise NapfError(
-                    f"worker processes died {deaths} times in a row, at run {first.start} or soon after (killed, "
-                    "or out of memory?); finished blocks are kept: repeat the command with fewer --workers"
+                    f"workers died {deaths} times in a row at run {first.start} or after it (killed, or out "
+                    "of memory?); finished blocks are kept: repeat the command with fewer --workers"
                 ) from error
 
 
@@ -87,7 +87,7 @@ def _in_pool(task: Callable[[range], T], blocks: list[range], workers: int) -> I
 
 @contextlib.contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Block Ctrl-C while processes start: they inherit that, and a Ctrl-C meanwhile comes to us afterwards."""
+    """Block Ctrl-C while processes start: they inherit that; one that comes meanwhile is ours afterwards."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return

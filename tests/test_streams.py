@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napf_mpc.streams import Stream, generator, normals, uniforms
+from napf_mpc.streams import NormalSequence, Stream, generator, normals, uniforms
 
 Draw = Callable[[int, range, Stream, int, int, int], NDArray[np.float64]]
 DRAWS = pytest.mark.parametrize("draw", [normals, uniforms])
@@ -31,7 +31,7 @@ def test_a_series_is_its_documented_stream() -> None:
 
 
 def test_no_two_streams_share_a_number() -> None:
-    """4,032 series of seeds 7 and 8 and of runs, streams, UAVs and axes: no seed + i, no overlap."""
+    """Thousands of series of seeds 7 and 8, runs, streams, UAVs and axes: no seed + i, no overlap."""
     seen: set[float] = set()
     count = 0
     for seed, run, stream, uav, axis in itertools.product((7, 8, 0), range(8), Stream, range(6), range(4)):
@@ -52,6 +52,16 @@ def test_neighbouring_keys_do_not_correlate() -> None:
     ]  # fmt: skip
     correlation = np.corrcoef(series)
     assert np.abs(correlation - np.eye(len(series))).max() < 4.5 / np.sqrt(10_000)
+
+
+@pytest.mark.parametrize("ahead", [1, 7, 256])
+@pytest.mark.parametrize("uavs", [1, 30])
+def test_step_by_step_they_are_the_same_numbers(ahead: int, uavs: int) -> None:
+    """Whatever is drawn ahead, and for more series than fit one band."""
+    whole = normals(5, range(2, 5), Stream.OWN_ERROR, uavs, 3, 20)
+    sequence = NormalSequence(5, range(2, 5), Stream.OWN_ERROR, uavs, ahead=ahead)
+    for step in range(20):
+        np.testing.assert_array_equal(sequence.take(), whole[..., step])
 
 
 def test_laws() -> None:

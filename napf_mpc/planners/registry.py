@@ -8,9 +8,12 @@ from napf_mpc.errors import ProblemError
 from napf_mpc.planners.planner import Planner
 from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner
 from napf_mpc.problem import Problem
+from napf_mpc.words import did_you_mean, shown_text
 
 PLANNERS: dict[str, Callable[[Problem], Planner]] = {"apf": ApfPlanner, "napf": NapfPlanner}
 """Name -> factory."""
+ANNOUNCED = ("qp",)
+"""Names that problem files may hold, but that this version cannot fly."""
 
 
 def make_planner(name: str, problem: Problem) -> Planner:
@@ -22,5 +25,7 @@ def make_planner(name: str, problem: Problem) -> Planner:
         If there is no planner of that name in this version.
     """
     if name not in PLANNERS:
-        raise ProblemError("planner", [f'"{name}" is not built in this version; choose from {", ".join(PLANNERS)}'])
+        reason = "is not built in this version" if name in ANNOUNCED else "is not a planner"
+        choice = f"choose from {', '.join(PLANNERS)}{did_you_mean(name, PLANNERS)}"
+        raise ProblemError("planner", [f'"{shown_text(name)}" {reason}; {choice}'])
     return PLANNERS[name](problem)

@@ -151,7 +151,7 @@ class _Film:
         wide = PAGE_IN - left - 0.1
         scale = min(wide / view.width, 4.2 / view.height)
         side_w = scale * view.width if self._level else wide
-        side_h = min(max(side_w / (span[1] - span[0]) * (high - low), 0.6), 1.6)
+        side_h = min(max(side_w / (span[1] - span[0]) * (high - low), 0.6), 2.4)
         height = bottom + side_h + gap + scale * view.height + top
         page = Page.of_size(PAGE_IN, height, credit_of(problem))
         canvas: Any = FigureCanvasAgg(page.figure)  # its drawing methods have no type information

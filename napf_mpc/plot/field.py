@@ -186,7 +186,8 @@ def limit_cases(problem: Problem) -> list[tuple[str, ObstacleSet]]:
     """Two scenes, with names, in which the traditional potential field does not get to its goal."""
     mission = goal_mission(problem)
     start, goal = np.array(mission.start_m), np.array(mission.goal_m)
-    back = (start - goal) / float(np.hypot(*(start - goal)))
+    apart = float(np.hypot(*(start - goal)))
+    back = (start - goal) / apart if apart > 0.0 else np.array([-1.0, 0.0])
     # Beside the line, so that only the nearness to the goal matters.
     side = np.array([-back[1], back[0]])
     at_goal = goal + NEAR_GOAL_M * (np.cos(0.35) * back + np.sin(0.35) * side)

@@ -217,7 +217,8 @@ def draw_paths(axes: Axes, x: Array, y: Array, label: bool) -> None:
     place = float(x[-1].min()) - 0.09 * inch if westward else float(x[-1].max()) + 0.09 * inch
     for uav, height in enumerate(spread(y[-1], 0.135 * inch).tolist()):
         side = "right" if westward else "left"
-        axes.text(place, height, f"UAV {uav + 1}", color=uav_colour(uav), va="center", ha=side)
+        words = axes.text(place, height, f"UAV {uav + 1}", color=uav_colour(uav), va="center", ha=side)
+        words.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.75})
 
 
 def mark_contacts(axes: Axes, places: Sequence[tuple[float, float]]) -> None:

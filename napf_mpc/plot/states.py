@@ -191,20 +191,17 @@ def distance_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> F
 def _draw_distance(axes: Axes, time_s: Array, values: Array, limit: float, far_m: float, words: str) -> None:
     finite = values[np.isfinite(values)]
     draw_over_time(axes, time_s, np.where(np.isfinite(values), values, np.nan))
-    high = min(far_m, float(finite.max()) if len(finite) else 1.0)
-    low = min(limit, float(finite.min()) if len(finite) else 0.0)
-    pad = 0.08 * (high - low)
-    axes.set_ylim(low - max(pad, 0.3), max(high, limit + 1.0))
+    high = max(limit + 1.0, min(far_m, float(finite.max()) if len(finite) else 1.0))
+    low = min(limit, float(finite.min()) if len(finite) else limit)
+    axes.set_ylim(low - 0.17 * (high - low), high)
     style: dict[str, Any] = {"color": BLACK, "linewidth": 0.8, "linestyle": (0, (4, 2)), "zorder": 5}
     axes.axhline(limit, **style)
     axes.annotate(
         words,
         (1.0, limit),
         xycoords=("axes fraction", "data"),
-        xytext=(-2, 2),
+        xytext=(-2, -2),
         textcoords="offset points",
         ha="right",
-        va="bottom",
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.8},
-        zorder=6,
+        va="top",
     )

@@ -432,8 +432,10 @@ def test_planners_by_name() -> None:
     napf = make_planner("napf", problem(planner={"k": 1.7, "sigma": "rms"}))
     assert isinstance(napf, NapfPlanner)
     assert napf.inflation == Inflation(1.7, "shift", "rms")
-    for name in ("qp", "", "APF"):
-        with pytest.raises(ProblemError, match=r"not built in this version; choose from apf, napf"):
+    with pytest.raises(ProblemError, match='"qp" is not built in this version; choose from apf, napf'):
+        make_planner("qp", problem())
+    for name in ("", "APF", "apf "):
+        with pytest.raises(ProblemError, match="is not a planner; choose from apf, napf"):
             make_planner(name, problem())
 
 

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
+from matplotlib.transforms import Bbox
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
@@ -34,7 +35,6 @@ from napf_mpc.plot import (
     run_figures,
     scene,
 )
-from napf_mpc.plot.animate import FRAMES
 from napf_mpc.plot.compare import clearance_figure, ecdf, published, risk_figure, trade_figure
 from napf_mpc.plot.field import limit_cases, potential_at, surface_figure, walk_figure
 from napf_mpc.plot.flight import MOST_INFLATED, paths_figure, spread, uncertainty_figure
@@ -42,7 +42,7 @@ from napf_mpc.plot.overview import overview_figure
 from napf_mpc.plot.paper import without_errors
 from napf_mpc.plot.space import space_figure
 from napf_mpc.plot.states import angle_figure, attitude_figure, axis_figure, distance_figure, motion_figure
-from napf_mpc.plot.style import FONT_PT, credit_of, house_style, save, uav_colour
+from napf_mpc.plot.style import FONT_PT, credit_of, house_style, uav_colour
 from napf_mpc.plot.tracks import SUBSTEPS, Track, acting, clearances, contacts, encounters, separations, track
 from napf_mpc.problem import City, Problem
 from napf_mpc.problem_file import load_problem
@@ -375,20 +375,29 @@ def test_contacts_stand_in_both_views(problem: Problem) -> None:
         ("square_40", [12, 13, 14, 15, 21, 22, 23, 24, 25]),
     ],
 )
-def test_the_papers_figures_have_its_numbers(name: str, numbers: list[int], tmp_path: Path) -> None:
+def test_the_papers_figures_have_its_numbers(
+    name: str, numbers: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     limit = [] if len(numbers) == 1 else ["simulation.time_limit_s=5"]
+    drawn = name != "square_40"  # made as square_8's are
+    if not drawn:
+        monkeypatch.setattr("napf_mpc.plot.paper.save", lambda figure, out, stem: [out / stem, out / stem])
     written = paper_figures(load_problem(name, limit), name, SEED, tmp_path)
     assert sorted({int(path.name[3:5]) for path in written}) == numbers
     assert len(written) == 2 * len(numbers)
-    for path in written:
+    for path in written if drawn else []:
         check_picture(path)
 
 
-def test_any_other_problem_gets_the_figures_of_a_run(tmp_path: Path) -> None:
-    problem = load_problem("street_canyon", ["simulation.time_limit_s=5"])
-    written = paper_figures(problem, "street_canyon", SEED, tmp_path)
-    assert {path.name.split("_")[2] for path in written} == {"apf", "napf"}
-    assert len(written) == 24
+def test_any_other_problem_gets_the_figures_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[Any] = []
+    monkeypatch.setattr("napf_mpc.plot.paper.run_figures", lambda *given: called.append(given) or [])
+    problem = load_problem("street_canyon", ["simulation.time_limit_s=1"])
+    paper_figures(problem, "street_canyon", SEED, tmp_path)
+    ((given, name, trajectories, obstacles, planners, out),) = called
+    assert (given, name, planners, out) == (problem, "street_canyon", ("apf", "napf"), tmp_path)
+    assert set(trajectories["planner"]) == {"apf", "napf"}
+    assert len(obstacles) > 0
 
 
 def test_without_errors_the_estimate_is_the_truth(problem: Problem) -> None:
@@ -429,6 +438,20 @@ def test_single_uav_arrives_and_the_limits_are_limits() -> None:
     assert len(figure.axes) == 3
     assert has_line(figure, *walk.positions.T)
     assert figure.axes[1].get_title(loc="left").endswith("stuck")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["world.obstacles=[]"],
+        ["mission.goal_m=[0, 0]"],
+        ['world.obstacles=[{shape="box", centre_m=[5, 7, 0], size_m=[2, 2, 2]}]'],
+    ],
+)
+def test_odd_walks_can_be_drawn(settings: list[str]) -> None:
+    problem = load_problem("single_uav", settings)
+    surface_figure(problem, goal_scenes(problem)).draw_without_rendering()
+    walk_figure(problem, goal_scenes(problem)).draw_without_rendering()
 
 
 def test_a_formation_has_no_walk(problem: Problem, obstacles: ObstacleSet) -> None:
@@ -576,20 +599,21 @@ def test_only_buildings_in_view_are_drawn_and_the_taller_the_darker() -> None:
 
 
 def test_animation_moves_and_is_the_same_file_twice(
-    problem: Problem, block: Block, obstacles: ObstacleSet, tmp_path: Path
+    problem: Problem, obstacles: ObstacleSet, tmp_path: Path
 ) -> None:
-    one = animation(problem, block.trajectories, obstacles, tmp_path / "one.gif", "napf")
-    other = animation(problem, block.trajectories, obstacles, tmp_path / "deep" / "other.gif", "napf")
+    trajectories = fly_block(problem, ["napf"], SEED, range(1), None, 25).trajectories
+    one = animation(problem, trajectories, obstacles, tmp_path / "one.gif")
+    other = animation(problem, trajectories, obstacles, tmp_path / "deep" / "other.gif", "napf")
     assert one.read_bytes() == other.read_bytes()
     with Image.open(one) as film:
-        assert 10 < film.n_frames <= FRAMES
+        assert film.n_frames == 10
         first = np.asarray(film.convert("RGB"), dtype=int)
         film.seek(film.n_frames - 1)
         last = np.asarray(film.convert("RGB"), dtype=int)
     assert (np.abs(first - last).sum(-1) > 60).mean() > 0.002
     assert (first[0, 0] == 255).all()
     with pytest.raises(OutputError, match=r"\.gif"):
-        animation(problem, block.trajectories, obstacles, tmp_path / "film.mp4")
+        animation(problem, trajectories, obstacles, tmp_path / "film.mp4")
 
 
 # ------------------------------------------------------------------------------------ what can be read
@@ -629,11 +653,24 @@ def test_every_figure_can_be_read(
         for name, figure in figures_of(problem, block, obstacles, *campaign).items():
             renderer: Any = FigureCanvasAgg(figure).get_renderer()
             figure.draw(renderer)
-            width, height = figure.get_size_inches()
-            box = figure.get_tightbbox(renderer)
-            assert min(box.x0, box.y0) > -0.02, f"{name}: cut off at the lower left: {box}"
-            assert box.x1 < width + 0.02, f"{name}: cut off at the right: {box}"
-            assert box.y1 < height + 0.02, f"{name}: cut off at the top: {box}"
+            sides = [axis for axes in figure.axes for axis in axes._axis_map.values()]
+            # An axis in space counts ticks beyond its ends that are never drawn; its label is farther out.
+            drawn = [
+                axis.label.get_window_extent(renderer)
+                if hasattr(axis.axes, "zaxis")
+                else axis.get_tightbbox(renderer)
+                for axis in sides
+            ]
+            texts = [words for axes in figure.axes for words in (*axes.texts, axes.title) if words.get_text()]
+            drawn += [words.get_window_extent(renderer) for words in (*figure.texts, *figure.legends, *texts)]
+            box = Bbox.union([part for part in drawn if part is not None])
+            inside = (
+                box.x0 >= -1.0,
+                box.y0 >= -1.0,
+                box.x1 <= figure.bbox.x1 + 1.0,
+                box.y1 <= figure.bbox.y1 + 1.0,
+            )
+            assert all(inside), f"{name}: text is cut off (left, bottom, right, top): {inside}"
             for axes in figure.axes:
                 for words in (axes.get_xlabel(), axes.get_ylabel()):
                     assert not words or any(unit in words for unit in ("(m", "(s)", "(°", "(%)")), (
@@ -666,23 +703,20 @@ def test_credit_of_shared_data_is_on_the_figures(
         assert any(city.credit in text.get_text().replace("\n", " ") for text in figure.texts)
 
 
-def test_empty_worlds_lone_uavs_and_single_samples_can_be_drawn(problem: Problem, tmp_path: Path) -> None:
+def test_empty_worlds_lone_uavs_and_single_samples_can_be_drawn(problem: Problem) -> None:
     lone = straight_track(np.linspace([0.0, 0.0, 5.0], [0.0, 30.0, 5.0], 40)[:, None])
     blink = straight_track(np.zeros((1, 4, 3)))
     with house_style():
         for flown in (lone, blink):
-            for i, figure in enumerate(
-                (
-                    paths_figure(problem, flown, ObstacleSet.empty()),
-                    uncertainty_figure(problem, flown, ObstacleSet.empty()),
-                    motion_figure(problem, flown),
-                    attitude_figure(problem, flown),
-                    distance_figure(problem, flown, ObstacleSet.empty()),
-                    space_figure(problem, flown, ObstacleSet.empty()),
-                )
+            for figure in (
+                paths_figure(problem, flown, ObstacleSet.empty()),
+                uncertainty_figure(problem, flown, ObstacleSet.empty()),
+                motion_figure(problem, flown),
+                attitude_figure(problem, flown),
+                distance_figure(problem, flown, ObstacleSet.empty()),
+                space_figure(problem, flown, ObstacleSet.empty()),
             ):
-                for path in save(figure, tmp_path, str(i)):
-                    assert path.stat().st_size > 1000
+                figure.draw_without_rendering()
 
 
 def test_endless_cylinders_are_drawn_in_space_and_from_the_side(problem: Problem, napf: Track) -> None:
@@ -706,7 +740,8 @@ def test_neither_pyplot_nor_a_display_nor_the_users_settings_are_touched() -> No
         "import sys, matplotlib\n"
         "matplotlib.rcParams['lines.linewidth'] = 7.5\n"
         # To ask for the backend would choose one.
-        "settings = lambda: {key: matplotlib.rcParams[key] for key in matplotlib.rcParams if key != 'backend'}\n"
+        "rc = matplotlib.rcParams\n"
+        "settings = lambda: {key: rc[key] for key in rc if key != 'backend'}\n"
         "before = settings()\n"
         "from pathlib import Path\n"
         "from napf_mpc.plot import paper_figures\n"

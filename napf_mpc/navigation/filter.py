@@ -1,0 +1,289 @@
+r"""The navigation filter: position, velocity, error of the fixes and accelerometer bias of every UAV.
+
+It is given measurements alone: fixes with their reported covariance, GNSS velocity, and the velocity changes
+that accelerometers measured. It takes as known
+
+- sigma(t) of the fix as reported, that its error is sigma(t) g(t) with g a Gauss-Markov process of unit
+  variance, and the correlation time of g (``filter_correlation_time_s``, or a barometer's own);
+- the laws of the GNSS velocity's noise, of the accelerometer's noise and of its bias, as the problem gives
+  them;
+- attitude, and with it gravity in the body, without error;
+- the common-mode share, for what it reports of two UAVs.
+
+The axes are filtered apart. Where a fix reports a covariance between axes, that is not used to estimate, but
+carried through the gains that are, so the reported covariance has it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.navigation import cross_covariance, kalman
+from napf_mpc.navigation.sensors import bias_memory
+from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Recorded
+
+__all__ = ["GATE_PATIENCE_S", "RECEIVER_NOISE_M", "FilterModel", "KalmanFilter"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+RECEIVER_NOISE_M = 1e-3
+"""Sigma of a white noise of the position fix that the filter assumes beside the correlated error [m].
+
+There is none in the simulated fixes. It covers the trapezoidal rule of the prediction (under 1 mm) and keeps
+the arithmetic sound where an error never changes, so that two fixes would tell the velocity exactly.
+"""
+GATE_PATIENCE_S = 3.0
+"""Time for which fixes may be refused without one used in between [s]; the next one starts the filter anew."""
+
+
+@dataclass(frozen=True)
+class FilterModel:
+    """What the filter takes as known."""
+
+    period_s: float
+    """Length of a tick [s]."""
+    ticks_per_epoch: int
+    """Ticks from one epoch of fixes to the next."""
+    error_memory: Array
+    """(3,) correlation of the fix's error from one epoch to the next, on each axis."""
+    error_noise: Array
+    """(3,) variance of what is new in the unit error, 1 - memory^2."""
+    common_share: Array
+    """(3,) share of the fix's error variance that UAVs have in common."""
+    fixless_axis: Mask
+    """(3,) axes that are measured without a fix too (a barometer's)."""
+    coupled: bool
+    """Whether fixes report covariances between axes."""
+    velocity_sigma_mps: float
+    """Sigma of the GNSS velocity [m/s]."""
+    bias_sigma_mps2: float
+    """Sigma of the accelerometer's bias [m/s^2]."""
+    bias_memory: float
+    """Correlation of the bias over a tick."""
+    bias_noise: float
+    """Variance of what is new in the bias in a tick [m^2/s^4]."""
+    velocity_change_noise: float
+    """Variance of the noise in a measured velocity change [m^2/s^2]."""
+    gate: float
+    """Largest innovation in its sigmas; 0 for none."""
+    coast_sigma_m: float
+    """Largest sigma of an axis with which a solution without a fix counts as available [m]."""
+
+    @classmethod
+    def of_navigation(cls, navigation: Navigation, period_s: float, ticks_per_epoch: int) -> FilterModel:
+        """Take the model from a problem's navigation section."""
+        own = navigation.filter_correlation_time_s
+        share = np.full(3, navigation.common_mode_share)
+        match navigation:
+            case GaussMarkov():
+                times = [navigation.correlation_time_s if own is None else own] * 3
+            case ConstantBias():
+                times = [math.inf if own is None else own] * 3
+            case Recorded():
+                assert own is not None
+                times = [own] * 3
+        barometer = isinstance(navigation, Recorded) and navigation.vertical == "barometer"
+        if isinstance(navigation, Recorded) and barometer:
+            times[2] = navigation.barometer_correlation_time_s
+            share[2] = 0.0
+        lags = np.array([period_s * ticks_per_epoch / time if time > 0.0 else math.inf for time in times])
+        return cls(
+            period_s=period_s,
+            ticks_per_epoch=ticks_per_epoch,
+            error_memory=np.exp(-lags),
+            error_noise=-np.expm1(-2.0 * lags),
+            common_share=share,
+            fixless_axis=np.array([False, False, barometer]),
+            coupled=isinstance(navigation, Recorded),
+            velocity_sigma_mps=navigation.gnss_velocity_sigma_mps,
+            bias_sigma_mps2=navigation.accelerometer_bias_mps2,
+            bias_memory=bias_memory(navigation, period_s),
+            bias_noise=navigation.accelerometer_bias_mps2**2
+            * -math.expm1(-2.0 * period_s / navigation.accelerometer_bias_time_s),
+            velocity_change_noise=navigation.accelerometer_noise_mps_rts**2 * period_s,
+            gate=navigation.innovation_gate_sigma,
+            coast_sigma_m=navigation.filter_coast_sigma_m,
+        )
+
+
+class KalmanFilter:
+    """The filters of all UAVs of a block of runs.
+
+    Each begins with the first fix that it is given, at t = 0 also with one that is carried on from before:
+    position = fix, with the reported sigma; velocity = GNSS velocity; bias zero, with its sigma. After
+    :data:`GATE_PATIENCE_S` of refused fixes it does so again.
+
+    Parameters
+    ----------
+    model : FilterModel
+        What is taken as known.
+    runs, uavs : int
+        How many.
+    """
+
+    def __init__(self, model: FilterModel, runs: int, uavs: int) -> None:
+        self._model = model
+        self._mean = np.full((runs, uavs, 3, kalman.STATES), np.nan)
+        self._packed = np.full((runs, uavs, 3, kalman.PACKED), np.nan)
+        self._begun = np.zeros((runs, uavs), dtype=np.bool_)
+        self._used = np.zeros((runs, uavs), dtype=np.bool_)
+        self._refused_s = np.zeros((runs, uavs))
+        self._refused_fixes = np.zeros((runs, uavs), dtype=np.int64)
+        self._verdict = np.zeros((runs, uavs), dtype=np.int8)
+
+        shared = bool(model.common_share.any()) and 1 < uavs <= cross_covariance.MAX_UAVS
+        kept = runs if shared or model.coupled else 0
+        self._carried = np.empty((kept, uavs, 3, kalman.STATES, kalman.STATES))
+        self._response = np.empty((kept, uavs, 3, kalman.STATES))
+        self._common = np.zeros((runs if shared else 0, 3, uavs, uavs, kalman.STATES, kalman.STATES))
+        self._cross = np.zeros((runs if model.coupled else 0, uavs, 3, kalman.STATES, kalman.STATES))
+        tick = kalman.drift(model.period_s, model.bias_memory)
+        self._since = [np.eye(kalman.STATES)]
+        for _ in range(model.ticks_per_epoch):
+            self._since.append(tick @ self._since[-1])
+        self._age = 0
+        self._common_factor = np.zeros((runs, uavs, 3, 3 * uavs if shared else 1))
+
+    @property
+    def refused_fixes(self) -> NDArray[np.int64]:
+        """(run, uav) number of fixes refused so far, by the gate or as unusable."""
+        return self._refused_fixes.copy()
+
+    def predict(self, velocity_change: Array, active: Mask) -> None:
+        """Carry the estimates over a tick.
+
+        Parameters
+        ----------
+        velocity_change : array, shape (run, uav, 3)
+            As the accelerometers measured it, in the world frame, without gravity [m/s].
+        active : array of bool, shape (run,)
+            Runs that fly.
+        """
+        model = self._model
+        kalman.predict(
+            self._mean,
+            self._packed,
+            velocity_change,
+            model.period_s,
+            model.bias_memory,
+            model.velocity_change_noise,
+            model.bias_noise,
+            active,
+        )
+        self._age += 1
+
+    def correct(
+        self, position: Array, velocity: Array, covariance: Array, available: Mask, new: bool, active: Mask
+    ) -> None:
+        """Take in one epoch of fixes. Epochs come at their rate, also while there is no fix.
+
+        Parameters
+        ----------
+        position, velocity : array, shape (run, uav, 3)
+            Measured [m, m/s].
+        covariance : array, shape (run, uav, 3, 3)
+            Of the position's error, as reported [m^2].
+        available : array of bool, shape (run, uav)
+            Whether there is a fix.
+        new : bool
+            Whether the fix is a new one; one that the receiver repeats says nothing new.
+        active : array of bool, shape (run,)
+            Runs that fly.
+        """
+        model = self._model
+        variance = np.einsum("...ii->...i", covariance)
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(variance)
+        begins = ~self._begun | (self._refused_s >= GATE_PATIENCE_S - 1e-9)
+        first = not self._begun.any()
+        has_fix = (available | first) & (new | first)
+        self._carried[...] = self._since[-1]
+        kalman.correct(
+            self._mean,
+            self._packed,
+            position,
+            velocity,
+            sigma,
+            has_fix,
+            model.fixless_axis,
+            model.error_memory,
+            model.error_noise,
+            RECEIVER_NOISE_M**2,
+            model.velocity_sigma_mps**2,
+            model.bias_sigma_mps2**2,
+            model.gate,
+            begins,
+            active,
+            self._verdict,
+            self._carried,
+            self._response,
+        )
+        self._age = 0
+        self._note_verdict(available, active)
+        self._advance_covariances(covariance, sigma, active)
+
+    def _note_verdict(self, available: Mask, active: Mask) -> None:
+        verdict = self._verdict
+        flying = active[:, None]
+        begun = (verdict == kalman.BEGUN) & flying
+        used = ((verdict == kalman.USED) & flying) | begun
+        refused = (verdict == kalman.REFUSED) & flying
+        self._begun |= begun
+        self._refused_fixes += refused
+        self._used = (self._used | used) & ~refused & available
+        waiting = available & ~self._used & flying
+        epoch_s = self._model.period_s * self._model.ticks_per_epoch
+        self._refused_s = np.where(self._used, 0.0, self._refused_s + epoch_s * waiting)
+
+    def _advance_covariances(self, covariance: Array, sigma: Array, active: Mask) -> None:
+        if len(self._common):
+            begun = self._verdict == kalman.BEGUN
+            cross_covariance.advance_pairs(
+                self._common, self._carried, self._response, self._model.common_share, begun, active
+            )
+            self._common_factor = np.zeros_like(self._common_factor)
+            cross_covariance.factorise(self._common, self._common_factor)
+        if len(self._cross):
+            correlation = np.empty(sigma.shape)
+            for n, (a, b) in enumerate(cross_covariance.AXIS_PAIRS):
+                correlation[..., n] = covariance[..., a, b] / (sigma[..., a] * sigma[..., b])
+            cross_covariance.advance_axes(self._cross, self._carried, self._response, correlation, active)
+
+    def solution(self, time_s: float, attitude: Array, body_rates: Array) -> NavSolution:
+        """Issue the solution of now.
+
+        Parameters
+        ----------
+        time_s : float
+            Time since the start of the mission [s].
+        attitude, body_rates : array, shape (run, uav, 3)
+            Handed through: they are taken as free of error [rad, rad/s].
+
+        Returns
+        -------
+        NavSolution
+            Available with a fix in use, and without one while every axis' sigma is at most
+            ``filter_coast_sigma_m``. The common factor is that of the last epoch of fixes.
+        """
+        runs, uavs = self._begun.shape
+        position, velocity = np.empty((runs, uavs, 3)), np.empty((runs, uavs, 3))
+        covariance, widest = np.zeros((runs, uavs, 6, 6)), np.empty((runs, uavs))
+        kalman.report(self._mean, self._packed, position, velocity, covariance, widest)
+        if len(self._cross):
+            cross_covariance.report_axes(self._cross, self._since[self._age], covariance)
+        return NavSolution(
+            time_s=time_s,
+            available=self._used | (widest <= self._model.coast_sigma_m**2),
+            position=position,
+            velocity=velocity,
+            attitude=attitude,
+            body_rates=body_rates,
+            covariance=covariance,
+            common_factor=self._common_factor,
+        )

@@ -1,0 +1,112 @@
+"""Filtered navigation in the closed loop: sensors see the truth, the filter sees the sensors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.navigation.filter import FilterModel, KalmanFilter
+from napf_mpc.navigation.fix import PositionErrors
+from napf_mpc.navigation.replay import RecordedErrors
+from napf_mpc.navigation.sensors import Sensors
+from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.problem import Navigation
+
+__all__ = ["FilteredNavigation"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class FilteredNavigation:
+    """Navigation of a block of runs with ``navigation.filter = "kalman"``.
+
+    Parameters
+    ----------
+    navigation : Navigation
+        Sensors and filter.
+    errors : PositionErrors
+        Of the position fixes.
+    seed : int
+        Campaign seed.
+    runs : range
+        Runs of the block.
+    period_s : float
+        Length of a tick [s].
+    ticks_per_fix : int
+        Ticks from one epoch of fixes to the next.
+    velocity : array, shape (run, uav, 3)
+        True velocity at the start [m/s].
+    """
+
+    def __init__(
+        self,
+        navigation: Navigation,
+        errors: PositionErrors,
+        seed: int,
+        runs: range,
+        period_s: float,
+        ticks_per_fix: int,
+        velocity: Array,
+    ) -> None:
+        uavs = velocity.shape[1]
+        self._errors = errors
+        self._ticks_per_fix = ticks_per_fix
+        self._sensors = Sensors(navigation, seed, runs, uavs, period_s, velocity)
+        self._filter = KalmanFilter(
+            FilterModel.of_navigation(navigation, period_s, ticks_per_fix), len(runs), uavs
+        )
+
+    @property
+    def gated_fixes(self) -> NDArray[np.int64]:
+        """(run,) number of fixes that were refused so far, of all UAVs."""
+        return self._filter.refused_fixes.sum(axis=-1)
+
+    def solution(
+        self,
+        tick: int,
+        time_s: float,
+        position: Array,
+        velocity: Array,
+        attitude: Array,
+        body_rates: Array,
+        active: Mask,
+    ) -> NavSolution:
+        """Measure the truth at a tick and issue the solution; to be called once a tick, from tick 0 on.
+
+        Parameters
+        ----------
+        tick, time_s : int, float
+            Number of the tick and its time [s].
+        position, velocity, attitude, body_rates : array, shape (run, uav, 3)
+            The truth [m, m/s, rad, rad/s]. Attitude and rates are copied into the solution, position and
+            velocity reach it through measurements only.
+        active : array of bool, shape (run,)
+            Runs that fly; the estimates of others stand still.
+        """
+        if tick > 0:
+            self._filter.predict(self._sensors.velocity_change(velocity), active)
+        if tick % self._ticks_per_fix == 0:
+            epoch = tick // self._ticks_per_fix
+            fix = self._errors.fix(epoch)
+            self._filter.correct(
+                position + fix.error,
+                self._sensors.gnss_velocity(velocity),
+                fix.covariance,
+                fix.available,
+                _is_new(self._errors, epoch),
+                active,
+            )
+        return self._filter.solution(time_s, attitude.copy(), body_rates.copy())
+
+
+def _is_new(errors: PositionErrors, epoch: int) -> bool:
+    """Whether an epoch's fix is more than the last one repeated: a log slower than the fixes is held."""
+    if epoch == 0 or not isinstance(errors, RecordedErrors):
+        return True
+    before, now = (
+        math.floor(n * errors.period_s / errors.table.period_s + 1e-6) for n in (epoch - 1, epoch)
+    )
+    return now > before

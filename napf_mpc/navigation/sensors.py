@@ -1,0 +1,82 @@
+"""Sensors beside the position fix, simulated from the truth: GNSS velocity and accelerometers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.problem import Navigation
+from napf_mpc.streams import NormalSequence, Stream
+
+__all__ = ["Sensors", "bias_memory"]
+
+Array = NDArray[np.float64]
+
+
+def bias_memory(navigation: Navigation, period_s: float) -> float:
+    """Correlation of the accelerometer bias over a time: exp(-time / correlation time)."""
+    return math.exp(-period_s / navigation.accelerometer_bias_time_s)
+
+
+class Sensors:
+    r"""What receiver velocity and accelerometers of every UAV of every run measure.
+
+    GNSS velocity is the true one plus white noise. The accelerometers measure the change of the true velocity
+    over a tick, in the world frame (attitude and gravity are known without error), plus bias and noise:
+
+    .. math:: \Delta v_{meas} = \Delta v + dt\, b_k + \sqrt{dt}\, q\, n_k, \qquad
+              b_{k+1} = \phi\, b_k + \sigma_b \sqrt{1 - \phi^2}\, z_{k+1}, \quad b_0 = \sigma_b z_0.
+
+    All these errors carry ``error_scale``. They depend on the seed, the run, the UAV, the axis and the number
+    of the tick alone, so all planners of a comparison fly the same ones.
+
+    Parameters
+    ----------
+    navigation : Navigation
+        Sigmas and times.
+    seed : int
+        Campaign seed.
+    runs : range
+        Runs of the block.
+    uavs : int
+        Number of UAVs.
+    period_s : float
+        Length of a tick [s].
+    velocity : array, shape (run, uav, 3)
+        True velocity at the start [m/s].
+    """
+
+    def __init__(
+        self, navigation: Navigation, seed: int, runs: range, uavs: int, period_s: float, velocity: Array
+    ) -> None:
+        scale = navigation.error_scale
+        self._period_s = period_s
+        self._memory = bias_memory(navigation, period_s)
+        self._velocity_sigma = scale * navigation.gnss_velocity_sigma_mps
+        self._noise_sigma = scale * navigation.accelerometer_noise_mps_rts * math.sqrt(period_s)
+        self._bias_sigma = scale * navigation.accelerometer_bias_mps2
+        self._new_bias_sigma = self._bias_sigma * math.sqrt(
+            -math.expm1(-2.0 * period_s / navigation.accelerometer_bias_time_s)
+        )
+        # Five seconds ahead at the usual rates.
+        self._velocity_noise = NormalSequence(seed, runs, Stream.GNSS_VELOCITY, uavs, ahead=50)
+        self._bias_noise = NormalSequence(seed, runs, Stream.ACCELEROMETER_BIAS, uavs)
+        self._noise = NormalSequence(seed, runs, Stream.ACCELEROMETER_NOISE, uavs)
+        self._bias = self._bias_sigma * self._bias_noise.take()
+        self._velocity = velocity.copy()
+
+    def gnss_velocity(self, velocity: Array) -> Array:
+        """Measured velocity (run, uav, 3) of the next epoch of fixes [m/s]."""
+        return velocity + self._velocity_sigma * self._velocity_noise.take()
+
+    def velocity_change(self, velocity: Array) -> Array:
+        """Measured change of the velocity (run, uav, 3) over the tick that ends with the given true one [m/s]."""
+        measured = velocity - self._velocity
+        measured += self._period_s * self._bias
+        measured += self._noise_sigma * self._noise.take()
+        self._bias *= self._memory
+        self._bias += self._new_bias_sigma * self._bias_noise.take()
+        self._velocity[...] = velocity
+        return measured

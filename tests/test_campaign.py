@@ -1,0 +1,490 @@
+"""Campaigns: the same bits whatever the order, nothing lost, nothing mixed."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from napf_mpc import campaign, provenance, store
+from napf_mpc.block import MAX_RUNS, MAX_SEED, Block, check_campaign, fly_block, simulate
+from napf_mpc.campaign import block_size, check_flyable, chunks, compare, run_campaign
+from napf_mpc.errors import DataError, NapfError, OutputError, ProblemError, SceneError
+from napf_mpc.evaluate import METRICS, Outcome
+from napf_mpc.problem import Problem
+from napf_mpc.problem_file import load_problem
+
+BRIEF: dict[str, Any] = {
+    "mission": {"length_m": 1.0, "initial_velocities_mps": [[2.0, 0.0, 0.0]] * 4},
+    "world.count": 4,
+    "world.along_range_m": [0.0, 12.0],
+    "simulation.time_limit_s": 5.0,
+    "simulation.controller_rate_hz": 25.0,
+    "planner.rate_hz": 5.0,
+    "navigation.rate_hz": 5.0,
+}
+"""Settings that make table1_8 a flight of five seconds in 125 ticks, still with contacts and arrivals."""
+
+
+def brief(**settings: Any) -> Problem:
+    return load_problem("table1_8", BRIEF | settings)
+
+
+def fly(out: Path, runs: int, seed: int = 7, problem: Problem | None = None, **options: Any) -> str:
+    """Fly a campaign; give the digest of its table of runs."""
+    planners = options.pop("planners", ["apf", "napf"])
+    run_campaign(problem or brief(), planners, runs, seed, out, **options)
+    return digest(out)
+
+
+def digest(out: Path) -> str:
+    return hashlib.sha256((out / "runs.parquet").read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def hundred(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of an undisturbed campaign of 100 runs, in one block; only to be read."""
+    out = tmp_path_factory.mktemp("hundred") / "out"
+    fly(out, 100, block_runs=100)
+    return out
+
+
+# ------------------------------------------------------------------------------------------ the same bits
+
+
+@pytest.mark.parametrize(("workers", "block_runs"), [(1, 7), (1, 64), (2, 13), (2, 50)])
+def test_neither_blocks_nor_workers_change_a_bit(
+    workers: int, block_runs: int, hundred: Path, tmp_path: Path
+) -> None:
+    assert fly(tmp_path, 100, workers=workers, block_runs=block_runs) == digest(hundred)
+
+
+def test_blocks_of_one_change_no_bit(tmp_path: Path) -> None:
+    assert fly(tmp_path / "a", 9, block_runs=1) == fly(tmp_path / "b", 9, block_runs=9)
+
+
+def test_the_first_runs_are_those_of_a_shorter_campaign(hundred: Path, tmp_path: Path) -> None:
+    fly(tmp_path, 50)
+    short, long = store.read_table(tmp_path / "runs.parquet"), store.read_table(hundred / "runs.parquet")
+    first = long["run"] < 50
+    for name, values in short.items():
+        np.testing.assert_array_equal(values, long[name][first], err_msg=name)
+
+
+def test_another_seed_shares_no_run(hundred: Path, tmp_path: Path) -> None:
+    fly(tmp_path, 100, seed=8)
+    ours, theirs = store.read_table(hundred / "runs.parquet"), store.read_table(tmp_path / "runs.parquet")
+    for name in ("path_length_ratio", "min_clearance_m", "control_effort"):
+        defined = np.isfinite(ours[name])
+        assert defined.all()
+        assert not set(ours[name][defined]) & set(theirs[name])
+
+
+def test_the_problem_is_hard_enough_to_tell(hundred: Path) -> None:
+    """Some collide and some do not, and planners differ: equal digests above are not those of nothing."""
+    rows = store.read_table(hundred / "runs.parquet")
+    hits = rows["obstacle_contact"]
+    assert 5 < hits[rows["planner"] == "apf"].sum() < 95
+    assert (hits[rows["planner"] == "apf"] != hits[rows["planner"] == "napf"]).any()
+    assert {"reached", "collided"} <= set(rows["outcome"])
+
+
+# -------------------------------------------------------------------------------------------------- resume
+
+
+def flown_by(monkeypatch: pytest.MonkeyPatch) -> list[range]:
+    """Note every block that is flown from here on."""
+    flown: list[range] = []
+
+    def noted(problem: Problem, planners: Any, seed: int, runs: range, **options: Any) -> Block:
+        flown.append(runs)
+        return fly_block(problem, planners, seed, runs, **options)
+
+    monkeypatch.setattr(campaign, "fly_block", noted)
+    return flown
+
+
+def test_more_runs_fly_only_the_missing_ones(
+    hundred: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fly(tmp_path, 50, block_runs=20)
+    flown = flown_by(monkeypatch)
+    assert fly(tmp_path, 100, block_runs=20) == digest(hundred)
+    assert [run for runs in flown for run in runs] == list(range(50, 100))
+
+
+def test_fewer_runs_fly_nothing_and_are_those_of_a_shorter_campaign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fly(tmp_path / "a", 20, block_runs=8)
+    flown = flown_by(monkeypatch)
+    assert fly(tmp_path / "a", 10, block_runs=8) == fly(tmp_path / "b", 10)
+    assert flown == [range(10)]  # of the second campaign
+
+
+def test_a_hole_is_filled(hundred: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fly(tmp_path, 100, block_runs=25)
+    (tmp_path / "blocks" / "rows_00000025_00000050.parquet").unlink()
+    flown = flown_by(monkeypatch)
+    # Other blocks than the first time: what is left of the lost one must not be counted twice.
+    assert fly(tmp_path, 100, block_runs=10) == digest(hundred)
+    assert flown == [range(25, 35), range(35, 45), range(45, 50)]
+    timing = store.read_table(tmp_path / "timing.parquet")
+    assert timing["runs"].sum() == 2 * 100
+
+
+class Cut(Exception):
+    """Stands for whatever ends a process."""
+
+
+@pytest.mark.parametrize("after", [0, 1, 3])
+def test_what_is_finished_is_kept_when_flying_stops(
+    after: int, hundred: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown: list[range] = []
+
+    def cut_off(problem: Problem, planners: Any, seed: int, runs: range, **options: Any) -> Block:
+        if len(flown) == after:
+            raise Cut
+        flown.append(runs)
+        return fly_block(problem, planners, seed, runs, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(campaign, "fly_block", cut_off)
+        with pytest.raises(Cut):
+            fly(tmp_path, 100, block_runs=20)
+    assert len(list((tmp_path / "blocks").glob("rows_*"))) == after
+    assert fly(tmp_path, 100, block_runs=20) == digest(hundred)
+
+
+def test_a_full_disk_keeps_what_is_finished(
+    hundred: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = 0
+    write_table = store.write_table
+
+    def until_full(path: Path, *rest: Any) -> None:
+        nonlocal written
+        written += 1
+        if written == 6:
+            raise OutputError(f"{path}: cannot be written: No space left on device")
+        write_table(path, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "write_table", until_full)
+        with pytest.raises(OutputError, match="No space left on device"):
+            fly(tmp_path, 100, block_runs=20)
+    assert fly(tmp_path, 100, block_runs=20) == digest(hundred)
+
+
+def test_leftovers_of_a_killed_process_do_no_harm(hundred: Path, tmp_path: Path) -> None:
+    fly(tmp_path, 50)
+    (tmp_path / "blocks" / ".rows_00000050_00000100.parquet.0badcafe.partial").write_bytes(b"half")
+    (tmp_path / "blocks" / "timing_00000050_00000060.parquet").write_bytes(b"without its rows")
+    (tmp_path / ".summary.json.0badcafe.partial").write_bytes(b"half")
+    assert fly(tmp_path, 100) == digest(hundred)
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_progress_starts_with_what_is_there_and_ends_with_all(tmp_path: Path) -> None:
+    fly(tmp_path, 8, block_runs=8)
+    told: list[int] = []
+    fly(tmp_path, 20, block_runs=5, progress=told.append)
+    assert told == [8, 13, 18, 20]
+
+
+# ----------------------------------------------------------------------------------------- nothing is mixed
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"seed": 8}, "seed = 7, not 8"),
+        ({"planners": ["apf"]}, "planners = apf,napf, not apf"),
+        ({"record_every": 5}, "record_every = 0, not 5"),
+        ({"problem": brief(**{"planner.k": 2.0})}, f"problem_hash = {brief().digest()}, not "),
+    ],
+)
+def test_a_folder_with_another_campaign_is_refused_with_both(
+    change: dict[str, Any], told: str, tmp_path: Path
+) -> None:
+    before = fly(tmp_path, 4)
+    with pytest.raises(OutputError, match="holds results of another origin") as caught:
+        fly(tmp_path, 4, **change)
+    assert told in str(caught.value)
+    assert "choose another --out" in str(caught.value)
+    assert digest(tmp_path) == before
+
+
+def test_another_version_of_the_code_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fly(tmp_path, 2)
+    other = provenance.versions() | {"code": "0123456789abcdef"}
+    monkeypatch.setattr(provenance, "versions", lambda: other)
+    with pytest.raises(OutputError, match=r"versions\.code = [0-9a-f]{16}, not 0123456789abcdef"):
+        fly(tmp_path, 2)
+
+
+def test_another_name_for_the_same_problem_goes_on(tmp_path: Path) -> None:
+    before = fly(tmp_path, 4, name="mine")
+    assert fly(tmp_path, 4, name="yours") == before
+
+
+def test_a_folder_that_is_not_ours_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(OutputError, match="is not empty and holds no results of ours"):
+        fly(tmp_path, 2)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_two_campaigns_do_not_share_a_folder(tmp_path: Path) -> None:
+    fly(tmp_path, 2)
+    with (
+        store.locked(tmp_path),
+        pytest.raises(OutputError, match="is in use by another command"),
+    ):
+        fly(tmp_path, 4)
+
+
+DAMAGE: dict[str, Callable[[Path], object]] = {
+    "truncated": lambda path: path.write_bytes(path.read_bytes()[:-100]),
+    "empty": lambda path: path.write_bytes(b""),
+    "garbage": lambda path: path.write_bytes(b"PAR1" + b"\0" * 500 + b"PAR1"),
+    "one bit of a value": lambda path: path.write_bytes(one_bit_off(path)),
+}
+
+
+def one_bit_off(path: Path) -> bytes:
+    values = store.read_table(path)
+    value = values["control_effort" if "control_effort" in values else "wall_s"][0].tobytes()
+    content = path.read_bytes()
+    assert value in content
+    return content.replace(value, bytes([value[0] ^ 1]) + value[1:])
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("kind", ["rows", "timing"])
+def test_a_damaged_block_is_named_with_the_way_out(kind: str, damage: str, tmp_path: Path) -> None:
+    before = fly(tmp_path, 12, block_runs=4)
+    DAMAGE[damage](tmp_path / "blocks" / f"{kind}_00000004_00000008.parquet")
+    with pytest.raises(DataError, match=f"{kind}_00000004_00000008.parquet") as caught:
+        fly(tmp_path, 12, block_runs=4)
+    assert "and repeat the command" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert digest(tmp_path) == before
+    (tmp_path / "blocks" / "rows_00000004_00000008.parquet").unlink()
+    assert fly(tmp_path, 12, block_runs=4) == before
+
+
+def test_a_block_of_another_campaign_is_noticed(tmp_path: Path) -> None:
+    fly(tmp_path / "seven", 8, block_runs=4)
+    fly(tmp_path / "eight", 8, block_runs=4, seed=8)
+    name = "rows_00000004_00000008.parquet"
+    shutil.copy(tmp_path / "eight" / "blocks" / name, tmp_path / "seven" / "blocks" / name)
+    with pytest.raises(DataError, match=f"{name}: is not a block of this campaign"):
+        fly(tmp_path / "seven", 8)
+
+
+def test_a_renamed_block_is_noticed(tmp_path: Path) -> None:
+    fly(tmp_path, 8, block_runs=4)
+    blocks = tmp_path / "blocks"
+    (blocks / "rows_00000004_00000008.parquet").rename(blocks / "rows_00000008_00000012.parquet")
+    with pytest.raises(DataError, match=r"rows_00000008_00000012.parquet: is not a block of this campaign"):
+        fly(tmp_path, 12)
+
+
+def test_runs_that_are_there_twice_are_noticed(tmp_path: Path) -> None:
+    fly(tmp_path / "a", 8, block_runs=4)
+    fly(tmp_path / "b", 8, block_runs=8)
+    whole = "rows_00000000_00000008.parquet"
+    shutil.copy(tmp_path / "b" / "blocks" / whole, tmp_path / "a" / "blocks" / whole)
+    with pytest.raises(DataError, match="holds runs that"):
+        fly(tmp_path / "a", 8)
+
+
+# ------------------------------------------------------------------------------------------- what is written
+
+
+def test_the_summary_keeps_its_contract(hundred: Path) -> None:
+    summary = json.loads((hundred / "summary.json").read_text())
+    rows = store.read_table(hundred / "runs.parquet")
+    assert list(summary) == [
+        "problem", "problem_hash", "data", "seed", "versions", "planners", "paired"
+    ]  # fmt: skip
+    assert (summary["problem_hash"], summary["seed"], summary["data"]) == (brief().digest(), 7, {})
+    assert {"python", "napf-mpc", "numpy", "numba", "code"} <= set(summary["versions"])
+    assert list(summary["planners"]) == ["apf", "napf"]
+    for name, planner in summary["planners"].items():
+        mine = {key: values[rows["planner"] == name] for key, values in rows.items()}
+        hits = int(mine["obstacle_contact"].sum())
+        assert planner["runs"] == 100
+        assert sum(planner[str(outcome)] for outcome in Outcome) == 100
+        assert planner["collision_risk"] == hits / 100
+        assert 0.0 <= planner["collision_risk_low"] < hits / 100 < planner["collision_risk_high"] <= 1.0
+        assert planner["uav_collision_risk"] == mine["uavs_hit"].sum() / 400
+        assert planner["uav_collision_risk_low"] < planner["uav_collision_risk_high"]
+        assert planner["finished"] == mine["finished"].mean()
+        assert planner["joint_success"] == mine["joint_success"].mean()
+        assert planner["solver"] == {"status": {}, "iterations": None, "fall_backs": 0}
+        for metric in METRICS:
+            defined = mine[metric][np.isfinite(mine[metric])]
+            assert list(planner[metric]) == ["median", "p05", "p95", "mean", "n"]
+            assert planner[metric]["n"] == len(defined)
+            if len(defined):
+                assert planner[metric]["median"] == pytest.approx(np.median(defined), rel=1e-12)
+            else:
+                assert planner[metric]["median"] is None
+    (pair,) = summary["paired"]
+    assert list(pair) == ["a", "b", "both", "only_a", "only_b", "neither", "p_value", "p_value_corrected"]
+    assert pair["both"] + pair["only_a"] + pair["only_b"] + pair["neither"] == 100
+
+
+def test_the_tables_keep_their_contract(hundred: Path) -> None:
+    rows = store.read_table(hundred / "runs.parquet")
+    assert rows["planner"].tolist() == ["apf"] * 100 + ["napf"] * 100
+    assert rows["run"].tolist() == [*range(100), *range(100)]
+    assert set(rows["seed"]) == {7}
+    assert {"outcome", "finished", "obstacle_contact", "uav_contact", "joint_success", *METRICS} <= set(rows)
+    timing = store.read_table(hundred / "timing.parquet")
+    assert timing["planner"].tolist() == ["apf", "napf"]
+    assert timing["runs"].tolist() == [100, 100]
+    assert (timing["wall_s"] > 0.0).all()
+    assert not (hundred / "trajectories.parquet").exists()
+
+
+def test_trajectories_come_by_planner_run_time_and_uav_whatever_the_blocks(tmp_path: Path) -> None:
+    for name, block_runs in (("a", 2), ("b", 5)):
+        fly(tmp_path / name, 5, record_every=5, block_runs=block_runs)
+    a, b = (store.read_table(tmp_path / name / "trajectories.parquet") for name in "ab")
+    for key in a:
+        np.testing.assert_array_equal(a[key], b[key], err_msg=key)
+    order = np.lexsort((a["uav"], a["t_s"], a["run"], a["planner"]))
+    np.testing.assert_array_equal(order, np.arange(len(order)))
+    assert set(a["planner"]) == {"apf", "napf"}
+    assert set(a["run"]) == set(range(5))
+    assert np.unique(a["t_s"])[1] == pytest.approx(0.2)
+
+
+def test_compare_gives_the_summary_of_a_campaign(hundred: Path) -> None:
+    stored = json.loads((hundred / "summary.json").read_text())
+    summary = compare(brief(), runs=100, seed=7)
+    assert summary["planners"] == stored["planners"]
+    assert summary["paired"] == stored["paired"]
+
+
+# --------------------------------------------------------------------------------------------- bad settings
+
+
+@pytest.mark.parametrize(
+    ("planners", "runs", "seed", "workers", "told"),
+    [
+        (["apf"], 0, 0, 1, "runs = 0: must be a whole number from 1 to"),
+        (["apf"], -1, 0, 1, "runs = -1"),
+        (["apf"], MAX_RUNS + 1, 0, 1, f"runs = {MAX_RUNS + 1}"),
+        (["apf"], 2.5, 0, 1, "runs = 2.5"),
+        (["apf"], True, 0, 1, "runs = true"),
+        (["apf"], 1, -1, 1, "seed = -1: must be a whole number from 0 to 2**63 - 1"),
+        (["apf"], 1, MAX_SEED + 1, 1, "seed = "),
+        (["apf"], 1, 2**200, 1, "seed = "),
+        (["apf"], 1, 0, 0, "workers = 0"),
+        ([], 1, 0, 1, "planners: give a list of at least one name"),
+        ("apf", 1, 0, 1, "planners: give a list of at least one name"),
+        (["apf", "apf"], 1, 0, 1, "planners = apf,apf: each may be named once"),
+    ],
+)
+def test_settings_that_cannot_be_meant_are_refused(
+    planners: Any, runs: Any, seed: int, workers: int, told: str
+) -> None:
+    with pytest.raises(ProblemError) as caught:
+        check_campaign(planners, runs, seed, workers)
+    assert told in str(caught.value)
+
+
+def test_a_seed_of_thousands_of_digits_is_refused_in_few_words() -> None:
+    with pytest.raises(ProblemError, match="seed = an integer of more than 60 digits"):
+        check_campaign(["apf"], 1, 10**5000)
+
+
+def test_all_bad_settings_are_told_at_once() -> None:
+    with pytest.raises(ProblemError) as caught:
+        check_campaign([], 0, -1, 0)
+    assert len(caught.value.problems) == 4
+
+
+@pytest.mark.parametrize("runs", [range(0), range(0, 10, 2), range(-3, 2), 0, 1.5])
+def test_simulate_refuses_runs_that_are_no_runs(runs: Any) -> None:
+    with pytest.raises(ProblemError, match="runs = "):
+        simulate(brief(), "apf", runs=runs)
+
+
+def test_simulate_takes_the_runs_of_the_campaign(hundred: Path) -> None:
+    rows = store.read_table(hundred / "runs.parquet")
+    flown = simulate(brief(), "napf", seed=7, runs=range(40, 43))
+    stored = (rows["planner"] == "napf") & (rows["run"] >= 40) & (rows["run"] < 43)
+    np.testing.assert_array_equal(flown.score.metrics["min_clearance_m"], rows["min_clearance_m"][stored])
+    assert flown.trajectories == {}
+
+
+@pytest.mark.parametrize("planner", ["qp", "nonsense", ""])
+def test_a_planner_that_is_not_there_is_refused_before_anything_is_written(
+    planner: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ProblemError, match="choose from apf, napf"):
+        run_campaign(brief(), [planner], 1, 0, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_problem_that_cannot_be_flown_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    crowded = load_problem("table1_40", ["world.radius_m=[20, 20]"])
+    with pytest.raises(SceneError):
+        run_campaign(crowded, ["apf"], 1, 0, tmp_path / "out")
+    walk = load_problem("single_uav")
+    with pytest.raises(ProblemError, match="mission"):
+        run_campaign(walk, ["apf"], 1, 0, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+# ---------------------------------------------------------------------------------------------------- blocks
+
+
+def test_chunks_have_no_gaps_and_no_more_than_their_size() -> None:
+    assert chunks([0, 1, 2, 5, 6, 7, 8], 3) == [range(0, 3), range(5, 8), range(8, 9)]
+    assert chunks([], 3) == []
+    assert chunks(range(4), 10) == [range(4)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "runs", "workers", "every", "size"),
+    [
+        ([], 10_000, 1, 0, 256),  # 1024 UAVs
+        ([], 300, 2, 0, 150),  # each worker its share
+        ([], 20, 2, 0, 32),  # not worth a second process
+        (["simulation.time_limit_s=3600", "navigation.rate_hz=50"], 10_000, 1, 0, 5),  # memory for errors
+        (["world.count=100000"], 10_000, 1, 0, 10),  # memory for obstacles
+        ([], 10_000, 1, 5, 45),  # memory for trajectories
+    ],
+)
+def test_blocks_pay_and_fit_into_memory(
+    settings: list[str], runs: int, workers: int, every: int, size: int
+) -> None:
+    problem = load_problem("table1_8", settings)
+    scenario = check_flyable(problem, ["apf"])
+    assert block_size(problem, scenario, runs, workers, every) == size
+
+
+def test_a_run_larger_than_a_block_is_still_flown() -> None:
+    crowd = {"formation": {"shape": "line", "count": 2000}, "mission": {"length_m": 5.0}}
+    problem = load_problem("table1_8", crowd)
+    assert block_size(problem, check_flyable(problem, ["apf"]), 100) == 1
+
+
+def test_errors_of_a_worker_come_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run 0 fits, but not every run does: the scene's own error, from another process."""
+    problem = load_problem(
+        "table1_40", ["world.count=26", "world.radius_m=[0.5, 9]", "world.along_range_m=[20, 60]"]
+    )
+    with pytest.raises(NapfError, match="found a place"):
+        run_campaign(problem, ["apf"], 400, 3, tmp_path, workers=2, block_runs=40)

@@ -1,0 +1,226 @@
+"""Ctrl-C, SIGTERM, kill -9 at random moments: a clean stop, nothing left, and repeating gives the same bits."""
+
+import contextlib
+import hashlib
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals and process groups are POSIX")
+
+RUNS = 96
+PROBLEM = """
+# 64 UAVs: sixteen runs fill a block, so that a short campaign has six of them.
+[formation]
+shape = "line"
+count = 64
+[mission]
+length_m = 100.0
+[world]
+kind = "lanes"
+count = 8
+along_range_m = [0.0, 6.0]
+[simulation]
+time_limit_s = 2.5
+"""
+
+
+def command(out: Path, *options: str) -> list[str]:
+    problem = out.parent / "problem.toml"
+    problem.write_text(PROBLEM)
+    words = [
+        "montecarlo",
+        str(problem),
+        "--planner",
+        "apf",
+        "--runs",
+        str(RUNS),
+        "--seed",
+        "3",
+        "--out",
+        str(out),
+    ]
+    # Not the figures, which take longer than the flights.
+    start = (
+        "import sys; from napf_mpc import cli, figures; figures.draw_comparison = lambda *_: []; cli.main()"
+    )
+    return [sys.executable, "-c", start, *words, "--quiet", *options]
+
+
+@contextlib.contextmanager
+def started(out: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """Start a campaign as the leader of a group of its own; whatever is left of it goes at the end."""
+    process = subprocess.Popen(
+        command(out, *options),
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def alive(group: int) -> list[str]:
+    """Processes of a group that still run; those that only wait for their parent to look at them do not."""
+    ps = subprocess.run(["ps", "-A", "-o", "pgid=,stat=,args="], capture_output=True, text=True, check=True)
+    lines = [line.split(None, 2) for line in ps.stdout.splitlines()]
+    return [words[-1] for words in lines if words[0] == str(group) and not words[1].startswith("Z")]
+
+
+def wait_until_flying(out: Path, process: subprocess.Popen[str], blocks: int = 0) -> None:
+    deadline = time.monotonic() + 120.0
+    while process.poll() is None and time.monotonic() < deadline:
+        if (out / "blocks").is_dir() and len(finished(out)) >= blocks:
+            return
+        time.sleep(0.01)
+    raise AssertionError(f"ended before it could be stopped: {process.communicate()}")
+
+
+def finished(out: Path) -> list[Path]:
+    return sorted((out / "blocks").glob("rows_*.parquet"))
+
+
+def digest(out: Path) -> str:
+    return hashlib.sha256((out / "runs.parquet").read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    with started(out, "--workers", "1") as process:
+        stdout, stderr = process.communicate(timeout=300)
+    assert (process.returncode, stdout, stderr) == (0, "", "")
+    assert len(finished(out)) == 6
+    return digest(out)
+
+
+def complete(out: Path) -> str:
+    with started(out, "--workers", "2") as process:
+        _, stderr = process.communicate(timeout=300)
+    assert (process.returncode, stderr) == (0, "")
+    return digest(out)
+
+
+@pytest.mark.parametrize(
+    ("signum", "workers", "group"),
+    [
+        (signal.SIGINT, 1, True),  # Ctrl-C at a terminal
+        (signal.SIGINT, 2, True),
+        (signal.SIGTERM, 1, False),  # kill
+        (signal.SIGTERM, 2, False),
+        (signal.SIGTERM, 2, True),  # an init system that ends a service
+    ],
+)
+def test_a_stop_is_prompt_keeps_blocks_and_leaves_nothing_behind(
+    signum: signal.Signals, workers: int, group: bool, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    with started(out, "--workers", str(workers)) as process:
+        wait_until_flying(out, process, blocks=1)
+        before = time.monotonic()
+        os.killpg(process.pid, signum) if group else process.send_signal(signum)
+        stdout, stderr = process.communicate(timeout=30)
+        took = time.monotonic() - before
+        deadline = before + 3.0
+        while alive(process.pid) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert alive(process.pid) == []
+    assert process.returncode == 128 + signum
+    assert took < 3.0
+    assert stdout == ""
+    told = re.fullmatch(
+        rf"stopped: (\d+) of {RUNS} runs are kept in {re.escape(str(out))}; repeat the command to go on\n",
+        stderr,
+    )
+    assert told, stderr
+    # A block may have come to the disk just before the stop and not have been counted yet.
+    assert 16 * len(finished(out)) - int(told[1]) in (0, 16)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"), [("ctrl-c", 1), pytest.param("kill -9", 2, marks=pytest.mark.slow)]
+)
+def test_five_stops_at_random_moments_lose_nothing(
+    kind: str, seed: int, undisturbed: str, tmp_path: Path
+) -> None:
+    """Five times on the way to one result; each may come while processes start, fly, write or conclude."""
+    out = tmp_path / "out"
+    moments = random.Random(seed)
+    kept = 0
+    for _ in range(5):
+        with started(out, "--workers", "2") as process:
+            wait_until_flying(out, process)
+            time.sleep(moments.uniform(0.0, 2.5))
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGINT if kind == "ctrl-c" else signal.SIGKILL)
+            process.communicate(timeout=30)
+            assert process.returncode in ((0, 130) if kind == "ctrl-c" else (0, -9))
+        assert len(finished(out)) >= kept
+        kept = len(finished(out))
+    assert complete(out) == undisturbed
+
+
+def test_workers_end_with_a_process_that_was_killed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with started(out, "--workers", "2") as process:
+        wait_until_flying(out, process, blocks=1)
+        process.kill()  # this process alone: its workers get no signal
+        process.wait()
+        deadline = time.monotonic() + 10.0
+        while alive(process.pid) and time.monotonic() < deadline:
+            time.sleep(0.1)
+        assert alive(process.pid) == []
+
+
+def test_a_killed_worker_costs_its_block_only(undisturbed: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with started(out, "--workers", "2") as process:
+        wait_until_flying(out, process, blocks=1)
+        ps = subprocess.run(
+            ["ps", "-A", "-o", "pid=,ppid=,args="], capture_output=True, text=True, check=True
+        )
+        children = [line.split(None, 2) for line in ps.stdout.splitlines()]
+        workers = [
+            int(pid) for pid, parent, words in children if parent == str(process.pid) and "loky" in words
+        ]
+        os.kill(workers[-1], signal.SIGKILL)
+        _, stderr = process.communicate(timeout=120)
+    assert (process.returncode, stderr) == (0, "")
+    assert digest(out) == undisturbed
+
+
+def test_a_stop_without_an_output_folder_says_that_nothing_is_kept(tmp_path: Path) -> None:
+    words = command(tmp_path / "out", "--workers", "1")
+    words[words.index("montecarlo")] = "compare"
+    for option in ("--planner", "--out"):
+        del words[words.index(option) : words.index(option) + 2]
+    environment = os.environ | {"TMPDIR": str(tmp_path)}
+    process = subprocess.Popen(
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 60.0
+    while not list(tmp_path.glob("napf-mpc-*/blocks/rows_*")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert stderr == "stopped: nothing is kept without --out\n"
+    assert not list(tmp_path.glob("napf-mpc-*"))
