@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -48,15 +47,17 @@ Planner = Annotated[str | None, typer.Option(help="apf or napf (default: the pro
 Animation = Annotated[bool, typer.Option("--animation", help="Draw an animation too: some ten seconds.")]
 
 
-F = TypeVar("F", bound=Callable[..., None])
-
 _UsageError: Any = typer.BadParameter.__base__  # click's, wherever this version of typer keeps it
 
 
 def main() -> NoReturn:
     """Run the command line and leave with its exit code: 0, 1 (not reached), 2 (bad input), 130 or 143."""
     interrupts.handle_signals()
-    sys.exit(run_command())
+    try:
+        sys.exit(run_command())
+    except interrupts.Stopped as stop:
+        interrupts.say_stopped()
+        sys.exit(stop.exit_code)
 
 
 def run_command(arguments: Sequence[str] | None = None) -> int:
@@ -82,21 +83,6 @@ def run_command(arguments: Sequence[str] | None = None) -> int:
 def _complain(text: str) -> None:
     for line in text.splitlines():
         print(f"error: {line}", file=sys.stderr)
-
-
-def _command(function: F) -> F:
-    """Register a command that ends with the right words and exit code when it is told to stop."""
-
-    @functools.wraps(function)
-    def stoppable(*args: Any, **kwargs: Any) -> None:
-        try:
-            function(*args, **kwargs)
-        except KeyboardInterrupt as stop:  # caught before typer, to which every stop is Ctrl-C
-            interrupts.say_stopped()
-            raise typer.Exit(getattr(stop, "exit_code", 130)) from None
-
-    app.command()(stoppable)
-    return function
 
 
 def _problem(file: str, settings: list[str] | None) -> Problem:
@@ -129,7 +115,7 @@ def _print_json(value: Any) -> None:
     print(json.dumps(value, indent=2, allow_nan=False))
 
 
-@_command
+@app.command()
 def problems(
     schema: Annotated[bool, typer.Option("--schema", help="Print the JSON Schema of problem files.")] = False,
     as_json: Json = False,
@@ -150,7 +136,7 @@ def problems(
         print(f"{name:<{width}}  {title}")
 
 
-@_command
+@app.command()
 def validate(
     file: File, settings: Settings = None, data: Data = None, quiet: Quiet = False, as_json: Json = False
 ) -> None:
@@ -176,7 +162,7 @@ def validate(
         _say(note, quiet)
 
 
-@_command
+@app.command()
 def run(
     file: File,
     planner: Planner = None,
@@ -207,7 +193,7 @@ def run(
     raise typer.Exit(0 if flown.reached else 1)
 
 
-@_command
+@app.command()
 def compare(
     file: File,
     planners: Annotated[str, typer.Option(help="Planners, with commas.")] = "apf,napf",
@@ -225,7 +211,7 @@ def compare(
     _campaign(_problem(file, settings), file, names, runs, seed, workers, out, data, quiet, as_json)
 
 
-@_command
+@app.command()
 def montecarlo(
     file: File,
     out: OutNeeded,
@@ -248,7 +234,7 @@ def montecarlo(
     _campaign(problem, file, names, runs, seed, workers, out, data, quiet, as_json, ticks)
 
 
-@_command
+@app.command()
 def figures(
     source: Annotated[str, typer.Argument(metavar="FILE_OR_DIR", help="Problem, or folder with results.")],
     out: OutNeeded,

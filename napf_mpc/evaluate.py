@@ -15,6 +15,7 @@ from napf_mpc.navigation.consistency import normalised_errors
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.planner import Command
 from napf_mpc.problem import Problem
+from napf_mpc.safety_distance import Inflation
 from napf_mpc.simulate import POSITION, VELOCITY, Flight, Mask, Scenario, formation_mission
 from napf_mpc.vehicle.quadrotor import hover_input
 from napf_mpc.world.distance import COS, SIN, Solids, X, Y, solid_bounds
@@ -53,6 +54,9 @@ METRICS = (
     "finish_time_s",
     "min_clearance_m",
     "min_separation_m",
+    "within_k_sigma_east",
+    "within_k_sigma_north",
+    "within_k_sigma_up",
     "nees",
     "nees_position",
     "gated_fixes",
@@ -103,7 +107,8 @@ class MissionScore:
         self._flown = np.zeros((runs, uavs))
         self._start = self._frame.along_track(scenario.initial_state[..., POSITION])
         self._end = self._start.copy()
-        self._sums = np.zeros((runs, 5))
+        self._sums = np.zeros((runs, 9))
+        self._k = Inflation.of_planner(problem.planner).k
         self._below_since = np.full(runs, np.nan)
         self._passed_at = np.full(runs, np.nan)
         self._reform_time = np.full(runs, np.nan)
@@ -151,6 +156,8 @@ class MissionScore:
             1.0 / self._problem.simulation.controller_rate_hz,
             state,
             nav.position,
+            nav.covariance,
+            self._k,
             inputs,
             active,
             self._frame.origin,
@@ -214,6 +221,9 @@ class MissionScore:
                 "finish_time_s": flight.finish_time_s.copy(),
                 "min_clearance_m": _finite_or_nan(self._clearance.clearance.min(-1) - vehicle.radius_m),
                 "min_separation_m": _finite_or_nan(separation),
+                "within_k_sigma_east": self._sums[:, _WITHIN] / self._sums[:, _FIXES],
+                "within_k_sigma_north": self._sums[:, _WITHIN + 1] / self._sums[:, _FIXES],
+                "within_k_sigma_up": self._sums[:, _WITHIN + 2] / self._sums[:, _FIXES],
                 "nees": whole / compared,
                 "nees_position": position / compared,
                 "gated_fixes": gated.astype(np.float64),
@@ -253,7 +263,7 @@ def _finite_or_nan(values: Array) -> Array:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-_COUNT, _PATH, _SHAPE, _FLOOR, _EFFORT = 0, 1, 2, 3, 4
+_COUNT, _PATH, _SHAPE, _FLOOR, _EFFORT, _FIXES, _WITHIN = 0, 1, 2, 3, 4, 5, 6
 
 
 @compiled
@@ -262,6 +272,8 @@ def _accumulate(
     period_s: float,
     state: Array,
     estimate: Array,
+    covariance: Array,
+    k: float,
     inputs: Array,
     active: NDArray[np.bool_],
     origin: Array,
@@ -296,6 +308,11 @@ def _accumulate(
                     missed += (estimate[r, i, b] - place) * axes[a, b]
                 slot_error[i, a] = projected
                 nav_error[i, a] = missed
+            sums[r, _FIXES] += 1.0
+            for b in range(3):
+                error = estimate[r, i, b] - state[r, i, 2 * b]
+                if error * error <= k * k * covariance[r, i, b, b]:
+                    sums[r, _WITHIN + b] += 1.0
             centre += slot_error[i, 0]
             rear = min(rear, slot_error[i, 0])
             thrust = inputs[r, i, 0] - weight

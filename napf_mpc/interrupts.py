@@ -14,8 +14,8 @@ GRACE_S = 2.0
 _words = "stopped"
 
 
-class Stopped(KeyboardInterrupt):
-    """A signal asked this process to stop."""
+class Stopped(BaseException):
+    """A signal asked this process to stop. No KeyboardInterrupt: others catch that and exit as they like."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(signal.Signals(signum).name)

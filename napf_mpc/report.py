@@ -16,13 +16,16 @@ from napf_mpc.risk import wilson
 METRIC_LABELS = {
     "path_rms_m": "path RMS [m]",
     "shape_rms_m": "shape RMS [m]",
-    "shape_floor_m": "  its floor: navigation alone [m]",
+    "shape_floor_m": "  from navigation errors alone [m]",
     "path_length_ratio": "path length ratio",
     "control_effort": "control effort [N² s]",
     "reform_time_s": "time to re-form [s]",
     "finish_time_s": "finish time [s]",
     "min_clearance_m": "least clearance [m]",
     "min_separation_m": "least separation [m]",
+    "within_k_sigma_east": "share of errors within k sigma: east",
+    "within_k_sigma_north": "  north",
+    "within_k_sigma_up": "  up",
 }
 
 

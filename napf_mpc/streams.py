@@ -99,11 +99,11 @@ class NormalSequence:
         self._next = ahead
 
     def take(self) -> NDArray[np.float64]:
-        """Return the numbers of the next step, shape (run, uav, axis); not to be kept beyond the next call."""
+        """Return the numbers of the next step (run, uav, axis); not to be kept beyond the next call."""
         if self._next == len(self._steps):
             for numbers, source in zip(self._series, self._generators, strict=True):
                 source.standard_normal(out=numbers)
-            # A step is read at once, so its numbers are brought together; in bands, which is kinder to caches.
+            # A step is read at once, so its numbers are brought together; in bands, which suits caches.
             for first in range(0, len(self._series), 64):
                 self._steps[:, first : first + 64] = self._series[first : first + 64].T
             self._next = 0

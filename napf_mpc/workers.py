@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from typing import TypeVar
@@ -55,10 +56,11 @@ def in_workers(
     deaths = 0
     while left:
         try:
-            for block, result in _in_pool(task, list(left), workers):
-                del left[block]
-                deaths = 0
-                yield block, result
+            with contextlib.closing(_in_pool(task, list(left), workers)) as pool:
+                for block, result in pool:
+                    del left[block]
+                    deaths = 0
+                    yield block, result
         except BrokenProcessPool as error:
             deaths += 1
             if deaths == MAX_DEATHS:
@@ -69,7 +71,9 @@ def in_workers(
                 ) from error
 
 
-def _in_pool(task: Callable[[range], T], blocks: list[range], workers: int) -> Iterator[tuple[range, T]]:
+def _in_pool(
+    task: Callable[[range], T], blocks: list[range], workers: int
+) -> Generator[tuple[range, T], None, None]:
     import joblib  # only here: it costs start-up time that a single process need not pay
 
     parallel = joblib.Parallel(
@@ -81,8 +85,13 @@ def _in_pool(task: Callable[[range], T], blocks: list[range], workers: int) -> I
     )
     with _without_interrupts():
         results = parallel(joblib.delayed(_numbered)(task, block, os.getpid()) for block in blocks)
-    with contextlib.closing(results):
-        yield from results
+    try:
+        for result in results:  # noqa: UP028 - "yield from" would close it by itself, with warnings
+            yield result
+    finally:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that results are thrown away: it is what a stop is for
+            results.close()
 
 
 @contextlib.contextmanager

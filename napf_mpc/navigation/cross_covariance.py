@@ -1,13 +1,13 @@
 r"""What the estimation errors of two UAVs, or of two axes of one, have in common.
 
 The filter treats each axis of each UAV apart, but the errors of its fixes are shared in part. With the
-transition :math:`A_i` of an estimation error from one epoch of fixes to the next and its answer :math:`w_i` to
-the new part of its fix's error, both known from the filter's gains, the covariance of two such errors is
+transition :math:`A_i` of an estimation error from one epoch of fixes to the next and its answer :math:`w_i`
+to the new part of its fix's error, both known from the filter's gains, the covariance of two such errors is
 
 .. math:: M_{ij}' = A_i M_{ij} A_j^T + \rho\, w_i w_j^T,
 
-exactly, rho being the correlation of the two fixes' errors. It is no product :math:`L_i L_j` of two numbers: the
-gains follow sigma, so UAVs whose sigmas swing apart answer to the same error at different times.
+exactly, rho being the correlation of the two fixes' errors. It is no product :math:`L_i L_j` of two numbers:
+the gains follow sigma, so UAVs whose sigmas swing apart answer to the same error at different times.
 """
 
 from __future__ import annotations
@@ -159,9 +159,7 @@ def _advance(m: Array, f: Array, g: Array, v: Array, w: Array, correlation: floa
     for row in range(4):
         f0, f1, f2, f3 = f[row, 0], f[row, 1], f[row, 2], f[row, 3]
         for column in range(4):
-            half[row, column] = (
-                f0 * m[0, column] + f1 * m[1, column] + f2 * m[2, column] + f3 * m[3, column]
-            )
+            half[row, column] = f0 * m[0, column] + f1 * m[1, column] + f2 * m[2, column] + f3 * m[3, column]
     for column in range(4):
         g0, g1, g2, g3 = g[column, 0], g[column, 1], g[column, 2], g[column, 3]
         scale = correlation * w[column]

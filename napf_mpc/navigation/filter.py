@@ -39,7 +39,7 @@ There is none in the simulated fixes. It covers the trapezoidal rule of the pred
 the arithmetic sound where an error never changes, so that two fixes would tell the velocity exactly.
 """
 GATE_PATIENCE_S = 3.0
-"""Time for which fixes may be refused without one used in between [s]; the next one starts the filter anew."""
+"""Time of refused fixes without one used in between [s], after which the next starts the filter anew."""
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ class FilteredNavigation:
     @property
     def gated_fixes(self) -> NDArray[np.int64]:
         """(run,) number of fixes that were refused so far, of all UAVs."""
-        return self._filter.refused_fixes.sum(axis=-1)
+        return np.asarray(self._filter.refused_fixes.sum(axis=-1), dtype=np.int64)
 
     def solution(
         self,
@@ -106,7 +106,5 @@ def _is_new(errors: PositionErrors, epoch: int) -> bool:
     """Whether an epoch's fix is more than the last one repeated: a log slower than the fixes is held."""
     if epoch == 0 or not isinstance(errors, RecordedErrors):
         return True
-    before, now = (
-        math.floor(n * errors.period_s / errors.table.period_s + 1e-6) for n in (epoch - 1, epoch)
-    )
+    before, now = (math.floor(n * errors.period_s / errors.table.period_s + 1e-6) for n in (epoch - 1, epoch))
     return now > before

@@ -1,10 +1,11 @@
 r"""Compiled body of the navigation filter: four states on each axis of each UAV.
 
 States of an axis, in this order: position p [m], velocity v [m/s], the position fix's error in units of its
-sigma g, accelerometer bias b [m/s^2]. The covariance is symmetric; its ten numbers are kept in the order of
-:data:`PP` to :data:`BB`. Over a tick with the measured velocity change :math:`\Delta v`
+sigma g, accelerometer bias b [m/s^2]. The covariance is symmetric; its ten different numbers are kept, row by
+row. Over a tick with the measured velocity change :math:`\Delta v`
 
-.. math:: p' = p + dt\,v + \tfrac12 dt\,(\Delta v - dt\,b), \quad v' = v + \Delta v - dt\,b, \quad b' = \phi_b b
+.. math:: p' = p + dt\,v + \tfrac12 dt\,(\Delta v - dt\,b), \quad
+          v' = v + \Delta v - dt\,b, \quad b' = \phi_b b
 
 and from one epoch of fixes to the next :math:`g' = \phi g + \sqrt{1 - \phi^2}\,w`. A fix measures
 :math:`p + \sigma g` and v.
@@ -294,9 +295,7 @@ def _take_in(
 
 
 @compiled
-def _take_in_carried(
-    carried: Array, response: Array, k: Array, h_p: float, h_v: float, h_g: float
-) -> None:
+def _take_in_carried(carried: Array, response: Array, k: Array, h_p: float, h_v: float, h_g: float) -> None:
     for column in range(4):
         seen = h_p * carried[0, column] + h_v * carried[1, column] + h_g * carried[2, column]
         for row in range(4):
@@ -307,7 +306,9 @@ def _take_in_carried(
 
 
 @compiled
-def report(mean: Array, packed: Array, position: Array, velocity: Array, covariance: Array, widest: Array) -> None:
+def report(
+    mean: Array, packed: Array, position: Array, velocity: Array, covariance: Array, widest: Array
+) -> None:
     """Write out what a navigation solution holds.
 
     Parameters

@@ -72,7 +72,7 @@ class Sensors:
         return velocity + self._velocity_sigma * self._velocity_noise.take()
 
     def velocity_change(self, velocity: Array) -> Array:
-        """Measured change of the velocity (run, uav, 3) over the tick that ends with the given true one [m/s]."""
+        """Measured change of the velocity over a tick that ends with the given true one (run, uav, 3)."""
         measured = velocity - self._velocity
         measured += self._period_s * self._bias
         measured += self._noise_sigma * self._noise.take()
