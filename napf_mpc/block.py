@@ -18,7 +18,6 @@ from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.record import TrajectoryRecorder
 from napf_mpc.simulate import Scenario, build_scenario, closed_loop
-from napf_mpc.summary import score_rows
 from napf_mpc.words import shown_value
 
 MAX_RUNS = 10_000_000
@@ -163,6 +162,24 @@ def _fly(
     recorder = TrajectoryRecorder(planner.name, scenario.runs, record_every)
     flight = closed_loop(problem, planner, scenario, (judge, recorder))
     return judge.score(flight), scenario, recorder.columns()
+
+
+def score_rows(planner: str, seed: int, score: Score) -> store.Columns:
+    """Return one row a run: who, which run, how it ended, and its metrics."""
+    runs = len(score.runs)
+    return {
+        "planner": np.full(runs, planner),
+        "run": score.runs,
+        "seed": np.full(runs, seed, dtype=np.int64),
+        "outcome": np.array([str(outcome) for outcome in score.outcome]),
+        "finished": score.finished,
+        "obstacle_contact": score.obstacle_contact.any(-1),
+        "uav_contact": score.uav_contact,
+        "uavs_hit": score.obstacle_contact.sum(-1).astype(np.int64),
+        "uavs": np.full(runs, score.obstacle_contact.shape[1], dtype=np.int64),
+        "joint_success": score.joint_success,
+        **score.metrics,
+    }
 
 
 def timing_row(planner: str, runs: range, seconds: float) -> store.Columns:

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.apf import Walk, angle_step_walk
-from napf_mpc.block import Block, timing_row
+from napf_mpc.block import Block, score_rows, timing_row
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import METRICS, Outcome, Score
 from napf_mpc.formation import PathFrame
 from napf_mpc.problem import GoalMission, Problem
 from napf_mpc.store import Columns
-from napf_mpc.summary import score_rows
 from napf_mpc.words import shown_text
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.scenes import build_scenes

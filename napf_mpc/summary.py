@@ -1,4 +1,4 @@
-"""Tables of runs, and what is said of them: rates with intervals, quantiles, paired tests."""
+"""What is said of a table of runs: rates with intervals, quantiles, paired tests."""
 
 from __future__ import annotations
 
@@ -9,28 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.evaluate import METRICS, Outcome, Score
+from napf_mpc.evaluate import METRICS, Outcome
 from napf_mpc.risk import Rate, clustered_rate, paired_tests, quantiles, wilson
 
 Columns = dict[str, NDArray[Any]]
-
-
-def score_rows(planner: str, seed: int, score: Score) -> Columns:
-    """Return one row a run: who, which run, how it ended, and its metrics."""
-    runs = len(score.runs)
-    return {
-        "planner": np.full(runs, planner),
-        "run": score.runs,
-        "seed": np.full(runs, seed, dtype=np.int64),
-        "outcome": np.array([str(outcome) for outcome in score.outcome]),
-        "finished": score.finished,
-        "obstacle_contact": score.obstacle_contact.any(-1),
-        "uav_contact": score.uav_contact,
-        "uavs_hit": score.obstacle_contact.sum(-1).astype(np.int64),
-        "uavs": np.full(runs, score.obstacle_contact.shape[1], dtype=np.int64),
-        "joint_success": score.joint_success,
-        **score.metrics,
-    }
 
 
 def summarise(rows: Columns, identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -39,7 +21,7 @@ def summarise(rows: Columns, identity: Mapping[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     rows : dict of str to array
-        Columns of :func:`score_rows`; every planner has the same runs in the same order.
+        Columns of :func:`napf_mpc.block.score_rows`; every planner has the same runs in the same order.
     identity : mapping
         Of :func:`napf_mpc.provenance.identity`.
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from napf_mpc.evaluate import METRICS, Outcome
 from napf_mpc.problem_file import load_problem, problem_schema
 
 ROOT = Path(__file__).parents[1]
@@ -77,6 +78,11 @@ def test_every_key_is_in_the_reference() -> None:
     for model in problem_schema()["$defs"].values():
         for key in model["properties"]:
             assert f"`{key}`" in text or f"`{key} = " in text
+
+
+def test_every_metric_and_outcome_is_defined() -> None:
+    text = (DOCS / "statistics.md").read_text(encoding="utf-8")
+    assert [name for name in (*METRICS, *map(str, Outcome)) if f"`{name}`" not in text] == []
 
 
 @pytest.mark.parametrize("page", sorted([*ROOT.glob("*.md"), *DOCS.glob("*.md")]), ids=lambda page: page.name)

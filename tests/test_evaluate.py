@@ -282,6 +282,16 @@ def test_where_the_last_obstacle_ends(shapes: list[Shape], end_m: float, heading
     assert rear_at(passed_s) == pytest.approx(end_m, abs=0.045)
 
 
+def test_where_an_obstacle_ends_under_a_climbing_path() -> None:
+    """A mast that ends 27 m ahead on the map is passed at 27 m / cos 30 deg, one under it is not met."""
+    mission = {"kind": "formation", "length_m": 100.0, "heading_deg": 90.0, "climb_deg": 30.0}
+    given = problem(mission=mission)
+    scenario = build_scenario(given, 0, range(1))
+    masts = ObstacleSet.from_shapes([Cylinder((0.0, 26.0), 1.0), Cylinder((0.0, 60.0), 1.0, -50.0, -4.0)])
+    ends = MissionScore(given, replace(scenario, obstacles=masts))._last_obstacle
+    assert ends[0] == pytest.approx(27.0 / math.cos(math.radians(30.0)))
+
+
 def test_each_run_has_its_own_last_obstacle() -> None:
     given = problem()
     scenario = build_scenario(given, 0, range(3))

@@ -1,0 +1,562 @@
+"""The command line: exit codes, what is printed where, and what each command leaves behind."""
+
+import hashlib
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from napf_mpc import interrupts, store
+from napf_mpc.cli import run_command
+from napf_mpc.problem_file import load_problem
+from napf_mpc.scenario_file import read_scenes
+
+PROBLEM = """
+title = "Five seconds among four balls"
+[formation]
+shape = "square"
+[mission]
+length_m = 1.0
+initial_velocities_mps = [[2, 0, 0], [2, 0, 0], [2, 0, 0], [2, 0, 0]]
+[world]
+kind = "lanes"
+count = 4
+along_range_m = [0.0, 12.0]
+[vehicle]
+radius_m = 0.0
+[simulation]
+time_limit_s = 5.0
+controller_rate_hz = 25.0
+[planner]
+rate_hz = 5.0
+k = 1.7
+[navigation]
+rate_hz = 5.0
+[reference]
+source = "A paper"
+runs = 30
+collision_risk = { apf = 0.7333, napf = 0.1667 }
+"""
+COMMANDS = ["problems", "validate", "run", "compare", "montecarlo", "figures"]
+
+
+@pytest.fixture
+def problem(tmp_path: Path) -> str:
+    path = tmp_path / "brief.toml"
+    path.write_text(PROBLEM)
+    return str(path)
+
+
+class Figures:
+    """In place of the module that draws: notes what it is asked for."""
+
+    def __init__(self) -> None:
+        self.drawn: list[tuple[str, tuple[Any, ...]]] = []
+
+    def __getattr__(self, name: str) -> Any:
+        def draw(*given: Any) -> list[Path]:
+            self.drawn.append((name, given))
+            return [Path("figure.png"), Path("figure.svg")]
+
+        return draw
+
+
+@pytest.fixture(autouse=True)
+def figures(monkeypatch: pytest.MonkeyPatch) -> Figures:
+    """Nothing is drawn unless a test asks for it: pictures take longer than all the rest."""
+    stub = Figures()
+    monkeypatch.setitem(sys.modules, "napf_mpc.figures", stub)  # type: ignore[arg-type]
+    return stub
+
+
+def done(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a command in this process."""
+    code = run_command([str(word) for word in words])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+def process(*words: str | Path, **options: Any) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "napf_mpc", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+def digest(out: Path) -> str:
+    return hashlib.sha256((out / "runs.parquet").read_bytes()).hexdigest()
+
+
+# ---------------------------------------------------------------------------------------------------- help
+
+HELP = """
+import contextlib, io, sys, time
+from napf_mpc.cli import run_command
+with contextlib.redirect_stdout(io.StringIO()) as text:
+    code = run_command(sys.argv[1:])
+heavy = {"casadi", "joblib", "matplotlib", "numba", "numpy", "pyarrow", "scipy", "shapely"}
+print(code, len(text.getvalue()), time.process_time(), sorted(heavy & set(sys.modules)))
+"""
+
+
+@pytest.mark.parametrize("command", [None, *COMMANDS])
+def test_help_is_quick_and_loads_nothing_heavy(command: str | None) -> None:
+    words = ["--help"] if command is None else [command, "--help"]
+    shown = subprocess.run([sys.executable, "-c", HELP, *words], capture_output=True, text=True, check=True)
+    code, length, seconds, heavy = shown.stdout.split(maxsplit=3)
+    assert (code, heavy.strip()) == ("0", "[]")
+    assert int(length) > 200
+    assert float(seconds) < 0.5  # of processor time: this machine may be busy with other things
+
+
+def test_without_a_word_it_helps(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = done(capsys)
+    assert (code, err) == (0, "")
+    assert all(command in out for command in COMMANDS)
+
+
+def test_the_module_is_the_command() -> None:
+    shown = process("problems", "--json")
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert "table1_8" in {entry["name"] for entry in json.loads(shown.stdout)}
+
+
+# ----------------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("compare P --runs 0", "runs = 0: must be a whole number from 1 to 10000000"),
+        ("compare P --runs -1", "runs = -1"),
+        ("compare P --runs x", "Invalid value for '--runs'"),
+        ("compare P --runs 1e12", "Invalid value for '--runs'"),
+        ("compare P --runs 1000000000000", "runs = 1000000000000"),
+        ("compare P --seed -1", "seed = -1: must be a whole number from 0 to 2**63 - 1"),
+        (f"compare P --seed {2**200}", "seed = an integer of more than 60 digits"),
+        ("compare P --seed 2**200", "Invalid value for '--seed'"),
+        (f"run P --seed {2**63}", f"seed = {2**63}"),
+        ("run P --planner qp", '"qp" is not built in this version; choose from apf, napf'),
+        ("run P --planner nonsense", '"nonsense" is not a planner; choose from apf, napf'),
+        ("run P --planner nap", '"nap" is not a planner; choose from apf, napf; did you mean napf?'),
+        ("run P --planner=", '"" is not a planner'),
+        ("montecarlo P --planner qp --out O", '"qp" is not built'),
+        ("compare P --planners apf,qp", '"qp" is not built'),
+        ("compare P --planners=", "planners: give a list of at least one name"),
+        ("compare P --planners ,", "planners: give a list of at least one name"),
+        ("compare P --planners napf,apf,napf", "planners = napf,apf,napf: each may be named once"),
+        ("compare P --workers 0", "workers = 0: must be a whole number from 1 to 1024"),
+        ("compare P --workers 5000", "workers = 5000"),
+        ("run P --run-index -1", "run-index = -1: must be a whole number from 0 to 9999999"),
+        ("run P --run-index 99999999999", "run-index = 99999999999"),
+        ("run nowhere.toml", "nowhere.toml: no such file and no shipped problem of this name"),
+        ("run tabel1_8", "did you mean table1_8"),
+        ("run table1_8 --set nonsense", 'setting "nonsense": must be key.path=value'),
+        ("run table1_8 --set planner.kk=2", "planner.kk: unknown key; did you mean planner.k?"),
+        ("run table1_8 --set planner.k=-1", "planner.k = -1: must be >= 0 and <= 20"),
+        ("run table1_8 --set planner.kind=qp", '"qp" is not built'),
+        ("run single_uav --planner napf", '"napf" cannot walk to a goal; only "apf" can'),
+        ("compare single_uav", "mission.kind"),
+        ("validate nonsense", "no such file"),
+        ("validate table1_8 --set world.count=-1", "world.count = -1"),
+        ("figures nonsense --out O", "no such file"),
+        ("montecarlo P", "Missing option '--out'"),
+        ("montecarlo P --out O --cluster here", "No such option: --cluster"),
+        ("run", "Missing argument"),
+        ("run P P", "unexpected extra argument"),
+        ("sweep P", "No such command 'sweep'"),
+        ("comapre P", "No such command 'comapre'. Did you mean 'compare'?"),
+        ("run nishi_shinjuku --data D", "--data"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_exit_code_2(
+    words: str, told: str, problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = {"P": problem, "O": str(tmp_path / "out"), "D": str(tmp_path / "nodata")}
+    code, out, err = done(capsys, *(places.get(word, word) for word in words.split()))
+    assert (code, out) == (2, "")
+    assert told in err
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_fault_of_a_problem_has_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(PROBLEM.replace("k = 1.7", "k = nan\nspeed = 3").replace("count = 4", "count = -4"))
+    code, _, err = done(capsys, "validate", path)
+    assert code == 2
+    assert err.count("\n") == 3
+    assert all(key in err for key in ("planner.k", "planner.speed", "world.count"))
+
+
+def test_running_out_of_memory_is_one_line(
+    problem: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def too_much(*_: Any, **__: Any) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("napf_mpc.campaign.run_campaign", too_much)
+    code, out, err = done(capsys, "compare", problem)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: out of memory")
+
+
+# ------------------------------------------------------------------------------------- problems and validate
+
+
+def test_problems_are_listed_one_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = done(capsys, "problems")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert {"potential_surface", "single_uav", "square_8", "table1_40c", "nishi_shinjuku"} <= {
+        line.split()[0] for line in lines
+    }
+    assert all(len(line.split()) > 3 for line in lines)
+
+
+def test_the_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = done(capsys, "problems", "--schema")
+    assert code == 0
+    assert json.loads(out)["properties"].keys() >= {"formation", "mission", "world", "planner"}
+
+
+@pytest.mark.parametrize("name", ["table1_8", "single_uav", "street_canyon"])
+def test_shipped_problems_are_valid(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert done(capsys, "validate", name) == (0, f"{name}: valid\n", "")
+    code, out, _ = done(capsys, "validate", name, "--json")
+    assert code == 0
+    assert json.loads(out) == {
+        "file": name, "valid": True, "problem_hash": load_problem(name).digest(), "note": ""
+    }  # fmt: skip
+
+
+def test_valid_without_its_data_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NAPF_MPC_DATA", str(tmp_path))
+    code, out, err = done(capsys, "validate", "nishi_shinjuku")
+    assert (code, err) == (0, "")
+    assert "nishi_shinjuku: valid" in out
+    assert "buildings.geojson" in out
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "world.radius_m=[20, 20]",  # no room
+        "vehicle.mass_kg=0.01",  # the inner loop would be unstable
+    ],
+)
+def test_what_cannot_be_flown_is_not_valid(setting: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = done(capsys, "validate", "table1_40", "--set", setting)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+
+
+def test_quiet_prints_nothing(problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert done(capsys, "validate", problem, "--quiet") == (0, "", "")
+    assert done(capsys, "compare", problem, "--runs", "3", "--quiet") == (0, "", "")
+    code, out, err = done(capsys, "run", problem, "--quiet", "--out", tmp_path / "out")
+    assert code in (0, 1)
+    assert (out, err) == ("", "")
+
+
+# ------------------------------------------------------------------------------------------------------ run
+
+
+def test_run_ends_with_0_if_reached_and_1_if_not(problem: str, capsys: pytest.CaptureFixture[str]) -> None:
+    codes = {}
+    for run in range(6):
+        code, out, _ = done(capsys, "run", problem, "--planner", "apf", "--run-index", str(run), "--json")
+        codes[json.loads(out)["outcome"]] = code
+    assert codes.pop("reached") == 0
+    assert set(codes.values()) == {1}
+
+
+def test_run_flies_a_row_of_a_campaign_again_bit_by_bit(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["compare", problem, "--runs", "12", "--seed", "5", "--workers", "1", "--quiet"]
+    assert done(capsys, *words, "--out", tmp_path / "all")[0] == 0
+    everything = store.read_table(tmp_path / "all" / "runs.parquet")
+    for planner, run in (("apf", 0), ("napf", 7), ("napf", 11)):
+        out = tmp_path / f"{planner}{run}"
+        done(
+            capsys, "run", problem, "--seed", "5", "--run-index", str(run), "--planner", planner, "--quiet",
+            "--out", out,
+        )  # fmt: skip
+        row = (everything["planner"] == planner) & (everything["run"] == run)
+        for name, values in store.read_table(out / "runs.parquet").items():
+            np.testing.assert_array_equal(values, everything[name][row], err_msg=name)
+
+
+def test_run_leaves_all_that_is_needed_to_judge_it_again(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], figures: Figures
+) -> None:
+    out = tmp_path / "out"
+    code, text, err = done(capsys, "run", problem, "--run-index", "3", "--out", out)
+    assert code in (0, 1)
+    assert err == ""
+    assert "brief, planner napf, run 3 of seed 0" in text
+    assert f"results and figures: {out}" in text
+    assert sorted(path.name for path in out.iterdir() if not path.name.startswith(".")) == [
+        "campaign.json", "runs.parquet", "scenario.json", "summary.json", "timing.parquet",
+        "trajectories.parquet",
+    ]  # fmt: skip
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["run"], summary["planners"]["napf"]["runs"]) == (3, 1)
+    track = store.read_table(out / "trajectories.parquet")
+    contract = (
+        "run planner t_s uav x_m y_m z_m est_x_m est_y_m est_z_m sigma_x_m roll_rad roll_rate_radps thrust_n "
+        "ref_x_m slack_m solver_status"
+    )
+    assert set(contract.split()) <= set(track)
+    assert set(track["uav"]) == {0, 1, 2, 3}
+    # The verdict again, from the stored files alone: samples are coarser than the sweep, so never closer.
+    (shapes,) = read_scenes(out / "scenario.json").values()
+    centres = np.array([shape.centre_m for shape in shapes])  # type: ignore[union-attr]
+    radii = np.array([shape.radius_m for shape in shapes])  # type: ignore[union-attr]
+    points = np.stack([track["x_m"], track["y_m"], track["z_m"]], axis=-1)
+    sampled = (np.linalg.norm(points[:, None] - centres, axis=-1) - radii).min()
+    swept = store.read_table(out / "runs.parquet")["min_clearance_m"][0]
+    assert swept <= sampled + 1e-7
+    assert sampled - swept < 0.05
+    ((name, given),) = figures.drawn
+    assert name == "draw_mission"
+    assert given[1] == "brief"
+
+
+def test_run_again_into_its_folder_is_the_same_and_another_run_is_refused(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["run", problem, "--out", tmp_path / "out", "--quiet"]
+    first = done(capsys, *words)
+    before = digest(tmp_path / "out")
+    assert done(capsys, *words) == first
+    assert digest(tmp_path / "out") == before
+    code, _, err = done(capsys, *words, "--run-index", "1")
+    assert code == 2
+    assert "run = 0, not 1" in err
+    assert digest(tmp_path / "out") == before
+
+
+@pytest.mark.parametrize("name", ["single_uav", "potential_surface"])
+def test_a_walk_to_a_goal_runs_and_is_stored(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = done(capsys, "run", name, "--json", "--out", tmp_path / "out")
+    assert (code, err) == (0, "")
+    summary = json.loads(out)
+    assert summary["outcome"] == "reached"
+    assert summary["planners"]["apf"]["path_length_ratio"]["median"] > 1.0
+    assert summary == json.loads((tmp_path / "out" / "summary.json").read_text())
+    track = store.read_table(tmp_path / "out" / "trajectories.parquet")
+    assert np.hypot(track["x_m"][-1] - 10.0, track["y_m"][-1] - 10.0) <= 0.1
+    assert np.isnan(track["t_s"]).all()  # a walk has steps, no clock
+    assert track["step"].tolist() == list(range(len(track["step"])))
+
+
+# ------------------------------------------------------------------------------------ compare and montecarlo
+
+
+def test_compare_prints_rates_with_count_and_interval_beside_the_published(
+    problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = done(capsys, "compare", problem, "--runs", "20", "--workers", "1")
+    assert (code, err) == (0, "")
+    assert re.search(r"collision risk.*\d+ / 20 = \d+\.\d\d % \[\d+\.\d\d, \d+\.\d\d\]", out)
+    assert re.search(r"A paper.*73\.33 % \(n = 30\).*16\.67 % \(n = 30\)", out)
+    assert "path RMS [m]" in out  # rich would take [m] for markup
+    assert "exact McNemar p =" in out
+
+
+def test_json_is_all_there_is_on_standard_output(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = done(
+        capsys, "compare", problem, "--runs", "6", "--workers", "1", "--json", "--out", tmp_path / "out"
+    )
+    assert (code, err) == (0, "")
+    assert json.loads(out) == json.loads((tmp_path / "out" / "summary.json").read_text())
+
+
+def test_compare_leaves_its_tables_and_a_note(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], figures: Figures
+) -> None:
+    out = tmp_path / "out"
+    assert done(capsys, "compare", problem, "--runs", "6", "--workers", "1", "--out", out)[0] == 0
+    names = {path.name for path in out.iterdir()}
+    assert {"runs.parquet", "timing.parquet", "summary.json", "scenario.json", "comparison.md"} <= names
+    assert "| collision risk, any UAV and obstacle |" in (out / "comparison.md").read_text()
+    assert sorted(read_scenes(out / "scenario.json"), key=str) == list(range(6))
+    assert [name for name, _ in figures.drawn] == ["draw_comparison"]
+
+
+def test_montecarlo_goes_on_where_it_stopped(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["montecarlo", problem, "--planner", "apf", "--seed", "2", "--workers", "1", "--quiet"]
+    assert done(capsys, *words, "--runs", "5", "--out", tmp_path / "a") == (0, "", "")
+    first = sorted((tmp_path / "a" / "blocks").iterdir())
+    assert done(capsys, *words, "--runs", "11", "--out", tmp_path / "a") == (0, "", "")
+    assert done(capsys, *words, "--runs", "11", "--out", tmp_path / "b") == (0, "", "")
+    assert digest(tmp_path / "a") == digest(tmp_path / "b")
+    assert set(first) < set((tmp_path / "a" / "blocks").iterdir())
+
+
+def test_montecarlo_flies_the_problems_own_planner_and_keeps_trajectories(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["montecarlo", problem, "--runs", "3", "--workers", "1", "--trajectories", "--json", "--out", out]
+    code, text, _ = done(capsys, *words)
+    assert code == 0
+    assert list(json.loads(text)["planners"]) == ["napf"]
+    track = store.read_table(out / "trajectories.parquet")
+    assert set(track["run"]) == {0, 1, 2}
+    assert np.unique(track["t_s"])[:3] == pytest.approx([0.0, 0.2, 0.4])  # the planner's rate
+
+
+def test_settings_change_the_problem_and_are_part_of_it(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["compare", problem, "--runs", "4", "--workers", "1", "--quiet", "--out", tmp_path / "out"]
+    assert done(capsys, *words, "--set", "planner.k=0")[0] == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["problem_hash"] == load_problem(problem, ["planner.k=0"]).digest()
+    # k = 0 is the fixed safety distance: NAPF is then APF.
+    apf, napf = (summary["planners"][name] | {"solver": None} for name in ("apf", "napf"))
+    assert apf == napf
+    code, _, err = done(capsys, *words)
+    assert code == 2
+    assert "problem_hash = " in err
+
+
+@pytest.mark.parametrize("what", ["file", "somebody's", "another", "read-only"])
+def test_an_output_folder_that_cannot_be_used_is_one_line(
+    what: str,
+    problem: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = tmp_path / "out"
+    words = ["compare", problem, "--runs", "2", "--workers", "1", "--quiet", "--out", out]
+    if what == "file":
+        out.write_text("mine")
+    elif what == "somebody's":
+        out.mkdir()
+        (out / "thesis.tex").write_text("mine")
+    elif what == "another":
+        assert done(capsys, "run", problem, "--quiet", "--out", out)[0] in (0, 1)
+    else:
+        out.mkdir()
+        monkeypatch.setattr(os, "access", lambda path, mode: not mode & os.W_OK)
+    before = sorted(tmp_path.rglob("*"))
+    code, text, err = done(capsys, *words)
+    assert (code, text) == (2, "")
+    assert err.startswith(f"error: {out}: ")
+    assert "choose another --out" in err
+    assert err.count("\n") == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_changed_data_are_another_campaign(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    corners = [[0.0, 0.0], [1e-4, 0.0], [1e-4, 1e-4], [0.0, 1e-4], [0.0, 0.0]]
+    building = {
+        "type": "Feature",
+        "properties": {"height_m": 30.0},
+        "geometry": {"type": "Polygon", "coordinates": [corners]},
+    }
+    city = json.dumps({"type": "FeatureCollection", "features": [building]})
+    (data / "city.geojson").write_text(city)
+    text = PROBLEM.replace(
+        'kind = "lanes"\ncount = 4\nalong_range_m = [0.0, 12.0]', 'kind = "city"\nfile = "city.geojson"'
+    )
+    Path(problem).write_text(text)
+    words = ["compare", problem, "--runs", "2", "--workers", "1", "--data", data, "--out", tmp_path / "out"]
+    assert done(capsys, *words)[0] == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    content = (data / "city.geojson").read_bytes()
+    assert summary["data"] == {"city.geojson": hashlib.sha256(content).hexdigest()}
+    (data / "city.geojson").write_text(city.replace("30.0", "31.0"))
+    code, _, err = done(capsys, *words)
+    assert code == 2
+    assert "data.city.geojson = " in err
+
+
+# -------------------------------------------------------------------------------------------------- figures
+
+
+def test_figures_of_a_problem_and_of_a_folder(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], figures: Figures
+) -> None:
+    code, out, _ = done(capsys, "figures", problem, "--out", tmp_path / "out")
+    assert (code, out) == (0, "figure.png\nfigure.svg\n")
+    code, out, _ = done(capsys, "figures", tmp_path, "--out", tmp_path / "out", "--json")
+    assert json.loads(out) == ["figure.png", "figure.svg"]
+    assert [name for name, _ in figures.drawn] == ["draw_problem", "draw_stored"]
+
+
+# ------------------------------------------------------------------------------------------------- terminal
+
+
+class Terminal(io.StringIO):
+    """Standard error that says whether it is a terminal."""
+
+    def __init__(self, is_terminal: bool) -> None:
+        super().__init__()
+        self.is_terminal = is_terminal
+
+    def isatty(self) -> bool:
+        return self.is_terminal
+
+
+@pytest.mark.parametrize(
+    ("terminal", "option", "shown"),
+    [(True, None, True), (False, None, False), (True, "--quiet", False), (True, "--json", False)],
+)
+def test_a_progress_bar_is_for_terminals_only(
+    terminal: bool, option: str | None, shown: bool, problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error = Terminal(terminal)
+    monkeypatch.setattr(sys, "stderr", error)
+    # Rich would otherwise believe these more than the stream.
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    words = ["compare", problem, "--runs", "2", "--workers", "1", *([option] if option else [])]
+    assert run_command(words) == 0
+    assert ("missions" in error.getvalue()) == shown
+    assert shown or error.getvalue() == ""
+
+
+def test_words_for_a_stop_can_be_changed(capsys: pytest.CaptureFixture[str]) -> None:
+    interrupts.when_stopped("stopped: 3 of 4")
+    interrupts.say_stopped()
+    assert capsys.readouterr().err == "stopped: 3 of 4\n"
+    interrupts.when_stopped("stopped")
+
+
+def test_results_can_be_moved_and_drawn_elsewhere(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing in a folder of results holds a path."""
+    out = tmp_path / "out"
+    assert done(capsys, "compare", problem, "--runs", "2", "--workers", "1", "--quiet", "--out", out)[0] == 0
+    for path in out.rglob("*"):
+        if path.is_file():
+            assert str(tmp_path).encode() not in path.read_bytes(), path
+    shutil.move(out, tmp_path / "moved")
+    words = ["compare", problem, "--runs", "3", "--workers", "1", "--quiet", "--out", tmp_path / "moved"]
+    assert done(capsys, *words)[0] == 0
