@@ -26,7 +26,13 @@ METRIC_LABELS = {
     "within_k_sigma_east": "share of errors within k sigma: east",
     "within_k_sigma_north": "  north",
     "within_k_sigma_up": "  up",
+    "nees": "filter's NEES (1 is consistent)",
+    "nees_position": "  of the position alone",
+    "gated_fixes": "fixes refused by the filter",
 }
+
+
+_OF_FILTER = {"nees", "nees_position", "gated_fixes"}
 
 
 @dataclass(frozen=True)
@@ -82,7 +88,9 @@ def comparison(summary: dict[str, Any], reference: Reference | None = None) -> R
     for key, label in (("finished", "finished, contacts or not"), ("joint_success", "joint success")):
         rows.append((label, *[_fraction(p[key], p["runs"]) for p in each]))
     for key, label in METRIC_LABELS.items():
-        rows.append((label, *[_quantiles(p[key], p["runs"]) for p in each]))
+        # Without a navigation filter there is nothing to say of one.
+        if key not in _OF_FILTER or any(p[key]["n"] for p in each):
+            rows.append((label, *[_quantiles(p[key], p["runs"]) for p in each]))
     notes = [
         f"N = {runs} runs a planner, seed {summary['seed']}, the same scenes and errors for all.",
         "Rates: count / missions = rate [95 % interval] (Wilson; of one UAV: allowing for shared fates). "
@@ -143,7 +151,8 @@ def mission_table(row: dict[str, Any], name: str) -> Rows:
     cells.append(("joint success", "yes" if row["joint_success"] else "no"))
     for key, label in METRIC_LABELS.items():
         value = float(row[key])
-        cells.append((label, f"{value:.2f}" if value == value else "not defined"))
+        if key not in _OF_FILTER or value == value:
+            cells.append((label, f"{value:.2f}" if value == value else "not defined"))
     return Rows(
         f"{name}, planner {row['planner']}, run {row['run']} of seed {row['seed']}",
         ("", "value"),

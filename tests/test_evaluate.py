@@ -20,7 +20,9 @@ from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 Array = NDArray[np.float64]
 Motion = Callable[[float], Any]
 
-TICK_S = 0.02
+TICK_S = 0.1
+OF_NAVIGATION = ("shape_floor_m", "within_k_sigma", "nees", "gated_fixes")
+"""Metrics that say what navigation was worth; all others are about the truth alone."""
 ONE_OF_FOUR = np.array([(1.0,), (0.0,), (0.0,), (0.0,)])
 EAST, NORTH, UP = np.eye(3)
 
@@ -31,6 +33,7 @@ def problem(**sections: Any) -> Problem:
         "formation": {"shape": "square"},
         "mission": {"kind": "formation", "length_m": 100.0},
         "world": {"kind": "empty"},
+        "simulation": {"controller_rate_hz": 10.0},
     }
     return Problem.model_validate(given | sections)
 
@@ -71,9 +74,11 @@ def judged(
         estimate = before[..., POSITION] + frame.directions_to_world(
             np.broadcast_to(np.asarray(nav_error(now)), (runs, uavs, 3))
         )
+        covariance = np.zeros((runs, uavs, 6, 6))
+        covariance[..., [0, 1, 2], [0, 1, 2]] = 1.0
         nav = NavSolution(
             now, np.ones((runs, uavs), bool), estimate, *(np.zeros((runs, uavs, 3)) for _ in range(3)),
-            np.zeros((runs, uavs, 6, 6)), np.zeros((runs, uavs, 3, 1)),
+            covariance, np.zeros((runs, uavs, 3, 1)),
         )  # fmt: skip
         given_inputs = np.broadcast_to(np.asarray(inputs, dtype=float), (runs, uavs, 4)).copy()
         judge.ticked(now, before, nav, command, given_inputs, flying)
@@ -140,7 +145,7 @@ def test_what_the_formation_looked_like_while_it_took_shape_does_not_count() -> 
     """8 m out until 12 s, then 1 m on one UAV for half of the time left."""
 
     def offset(time_s: float) -> Array:
-        size = 8.0 if time_s < 11.99 else 1.0 if time_s < 21.99 else 0.0
+        size = 8.0 if time_s < 11.95 else 1.0 if time_s < 21.95 else 0.0
         return size * ONE_OF_FOUR * UP
 
     score = judged(offset, until_s=32.0)
@@ -157,10 +162,23 @@ def test_shape_floor_is_what_the_navigation_errors_alone_would_cause() -> None:
     assert metric(own, "shape_rms_m") == pytest.approx(0.0, abs=1e-12)
     common = judged(lambda _: np.zeros((4, 3)), nav_error=lambda _: np.array([3.0, -4.0, 5.0]))
     assert metric(common, "shape_floor_m") == pytest.approx(0.0, abs=1e-12)
-    noise = np.random.default_rng(1).normal(0.0, 2.0, (2000, 4, 3))
+    noise = np.random.default_rng(1).normal(0.0, 2.0, (400, 4, 3))
     drawn = judged(lambda _: np.zeros((4, 3)), nav_error=lambda t: noise[round(t / TICK_S)], until_s=40.0)
     # Independent errors of 2 m on three axes, less their mean: 2 sqrt(3 * 3/4) = 3 m.
-    assert metric(drawn, "shape_floor_m") == pytest.approx(3.0, rel=0.03)
+    assert metric(drawn, "shape_floor_m") == pytest.approx(3.0, rel=0.06)
+
+
+@pytest.mark.parametrize(("axis", "name"), [(0, "east"), (1, "north"), (2, "up")])
+def test_share_of_errors_within_the_reported_k_sigma(axis: int, name: str) -> None:
+    """Sigma reported as 1 m, k = 3: 2.9 m of one in four is within, 3.1 m is not, on its own axis."""
+    for size_m, share in ((2.9, 1.0), (3.1, 0.75), (-3.1, 0.75)):
+        score = judged(
+            lambda _: np.zeros((4, 3)),
+            until_s=2.0,
+            nav_error=lambda _, e=size_m: ONE_OF_FOUR * e * np.eye(3)[axis],
+        )
+        for other in ("east", "north", "up"):
+            assert metric(score, f"within_k_sigma_{other}") == (share if other == name else 1.0)
 
 
 # ------------------------------------------------------------------------------------- way, effort, time
@@ -202,10 +220,10 @@ def rear_at(time_s: float) -> float:
 def test_re_forming_counts_from_the_last_obstacle_until_the_shape_holds() -> None:
     """A ball ends at 20 m; the rear passes it at 13.2 s; one UAV is 4 m out until 18 s."""
     score = judged(
-        lambda t: (4.0 if t < 17.99 else 0.0) * ONE_OF_FOUR * UP, shapes=[Sphere((19.0, 0.0, 0.0), 1.0)]
+        lambda t: (4.0 if t < 17.95 else 0.0) * ONE_OF_FOUR * UP, shapes=[Sphere((19.0, 0.0, 0.0), 1.0)]
     )
     passed_s = (20.0 - REAR_M) / 2.0
-    assert metric(score, "reform_time_s") == pytest.approx(18.0 - passed_s, abs=0.021)
+    assert metric(score, "reform_time_s") == pytest.approx(18.0 - passed_s, abs=0.101)
     assert rear_at(passed_s) == pytest.approx(20.0)
 
 
@@ -225,13 +243,13 @@ def test_a_shape_that_holds_for_less_than_a_second_is_not_re_formed() -> None:
     """In shape for 0.9 s at 15 s and for good from 20 s."""
 
     def offset(time_s: float) -> Array:
-        return (0.0 if 14.99 < time_s < 15.89 or time_s > 19.99 else 5.0) * ONE_OF_FOUR * UP
+        return (0.0 if 14.95 < time_s < 15.85 or time_s > 19.95 else 5.0) * ONE_OF_FOUR * UP
 
     ball: list[Shape] = [Sphere((19.0, 4.0, 0.0), 1.0)]
     passed_s = (20.0 - REAR_M) / 2.0
     score = judged(offset, shapes=ball)
-    assert metric(score, "reform_time_s") == pytest.approx(20.0 - passed_s, abs=0.041)
-    assert np.isnan(metric(judged(offset, shapes=ball, until_s=20.9), "reform_time_s"))
+    assert metric(score, "reform_time_s") == pytest.approx(20.0 - passed_s, abs=0.101)
+    assert np.isnan(metric(judged(offset, shapes=ball, until_s=20.8), "reform_time_s"))
 
 
 TURNED = Box((30.0, 0.0, 0.0), (10.0, 10.0, 4.0), math.radians(45.0))
@@ -275,11 +293,11 @@ def test_where_the_last_obstacle_ends(shapes: list[Shape], end_m: float, heading
                 turned.append(Prism((shape.rings[0] @ rotation[:2, :2].T,), shape.base_m, shape.top_m))
     mission = {"kind": "formation", "length_m": 100.0, "heading_deg": heading_deg}
     score = judged(
-        lambda t: (9.0 if t < 29.99 else 0.0) * ONE_OF_FOUR * UP,
+        lambda t: (9.0 if t < 29.95 else 0.0) * ONE_OF_FOUR * UP,
         shapes=turned, mission=mission, from_s=14.0, until_s=31.1,
     )  # fmt: skip
     passed_s = 30.0 - metric(score, "reform_time_s")
-    assert rear_at(passed_s) == pytest.approx(end_m, abs=0.045)
+    assert rear_at(passed_s) == pytest.approx(end_m, abs=0.21)
 
 
 def test_where_an_obstacle_ends_under_a_climbing_path() -> None:
@@ -422,7 +440,7 @@ def test_runs_that_are_over_are_not_judged_further() -> None:
 
 
 def test_the_judge_looks_at_truth_and_not_at_the_estimate() -> None:
-    """Estimates far out or in a solid change the floor and nothing else."""
+    """Estimates far out or in a solid change what is said of the estimates, and nothing else."""
     ball: list[Shape] = [Sphere((20.0, 12.0, 0.0), 1.0)]
     plain = judged(lambda _: np.zeros((4, 3)), shapes=ball, until_s=20.0)
     astray = judged(
@@ -430,6 +448,9 @@ def test_the_judge_looks_at_truth_and_not_at_the_estimate() -> None:
     )
     assert plain.outcome == astray.outcome
     for name in METRICS:
-        if name != "shape_floor_m":
+        if name != "shape_floor_m" and not name.startswith("within_k_sigma"):
             np.testing.assert_array_equal(plain.metrics[name], astray.metrics[name], err_msg=name)
     assert metric(astray, "shape_floor_m") == pytest.approx(9.0 * math.sqrt(3.0) * math.sqrt(3.0) / 4.0)
+    for axis in ("east", "north", "up"):  # one UAV of four is nine sigma away
+        assert metric(plain, f"within_k_sigma_{axis}") == 1.0
+        assert metric(astray, f"within_k_sigma_{axis}") == 0.75

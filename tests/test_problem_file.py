@@ -191,7 +191,6 @@ ERRORS = '"gauss_markov", "constant" or "recorded"'
         ("world.obstacles[1]", "{}", f".shape: missing; must be {SHAPES}"),
         ("world.obstacles[1]", "4", f" = 4: must be a table with shape = {SHAPES}"),
         ("navigation.kind", "gnss", f' = "gnss": not built in this version; must be {ERRORS}'),
-        ("navigation.filter", "kalman", ' = "kalman": "kalman" is not built in this version; use "none"'),
         ("planner.kind", "nafp", f' = "nafp": must be {PLANNERS}; did you mean napf?'),
         ("planner.confidence", "1.0", " = 1.0: must be > 0 and < 1"),
         (
