@@ -60,6 +60,8 @@ StateWeight = Annotated[float, Field(ge=0.0, le=1e6)]
 InputWeight = Annotated[float, Field(ge=1e-6, le=1e6)]
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
 MAX_UAVS = 4096
+MAX_FIXES = 20_000_000
+"""Position fixes of all UAVs in one run: about a gigabyte of errors, drawn before the run starts."""
 
 
 class _Section(BaseModel):
@@ -692,7 +694,7 @@ class Problem(_Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Problem:
-        faults = [*self._initial_faults(), *self._rate_faults()]
+        faults = [*self._initial_faults(), *self._rate_faults(), *self._size_faults()]
         if isinstance(self.mission, GoalMission) and self.uav_count != 1:
             faults.append(f"formation has {self.uav_count} UAVs, a mission of kind goal needs exactly 1")
         if isinstance(self.mission, GoalMission) and self.planner.kind != "apf":
@@ -712,6 +714,17 @@ class Problem(_Section):
             if rows is not None and len(rows) != self.uav_count:
                 faults.append(f"mission.{key} has {len(rows)} rows, the formation has {self.uav_count} UAVs")
         return faults
+
+    def _size_faults(self) -> list[str]:
+        """Each of these may be large, but not all of them at once."""
+        limit_s, rate_hz = self.simulation.time_limit_s, self.navigation.rate_hz
+        fixes = self.uav_count * limit_s * rate_hz
+        if isinstance(self.mission, GoalMission) or fixes <= MAX_FIXES:
+            return []
+        return [
+            f"{self.uav_count} UAVs, simulation.time_limit_s = {limit_s:g} and navigation.rate_hz = {rate_hz:g}"
+            f" make {fixes:.3g} position fixes a run, must be <= {MAX_FIXES:.3g}: lower one of the three"
+        ]
 
     def _rate_faults(self) -> list[str]:
         """Each slower rate must divide the faster one, so that every loop is a whole number of steps."""

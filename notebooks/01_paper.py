@@ -34,7 +34,7 @@ from IPython.display import Markdown, display
 
 from napf_mpc import compare, linearize, load_problem, simulate
 from napf_mpc.formation import formation_offsets, square_geometry
-from napf_mpc.goal_walk import goal_scene, walk_to_goal
+from napf_mpc.goal_walk import goal_scenes, walk_to_goal
 from napf_mpc.plot.compare import risk_figure
 from napf_mpc.plot.field import surface_figure, walk_figure
 from napf_mpc.plot.flight import paths_figure, uncertainty_figure
@@ -119,7 +119,7 @@ plt.show()
 # %%
 surface = load_problem("potential_surface")
 with house_style():
-    figure = surface_figure(surface, goal_scene(surface))
+    figure = surface_figure(surface, goal_scenes(surface))
 figure
 
 # %% [markdown]
@@ -129,10 +129,10 @@ figure
 
 # %%
 single = load_problem("single_uav")
-walk = walk_to_goal(single, goal_scene(single))
+walk = walk_to_goal(single, goal_scenes(single))
 print(f"arrived: {walk.arrived}, {len(walk.positions) - 1} steps of {single.mission.step_m} m")
 with house_style():
-    figure = walk_figure(single, goal_scene(single))
+    figure = walk_figure(single, goal_scenes(single))
 figure
 
 # %% [markdown]

@@ -1,11 +1,11 @@
 """Notebooks run from a fresh kernel, hold no algorithm, and are kept without outputs."""
 
 import ast
+import json
 import sys
 from pathlib import Path
 
 import jupytext
-import nbformat
 import pytest
 from jupyter_client.kernelspec import KernelSpecManager
 from jupyter_client.manager import AsyncKernelManager
@@ -53,7 +53,7 @@ def test_it_runs(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     spec.mkdir(parents=True)
     launch = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
     (spec / "kernel.json").write_text(
-        nbformat.json.dumps({"argv": launch, "display_name": "Python 3", "language": "python"})
+        json.dumps({"argv": launch, "display_name": "Python 3", "language": "python"})
     )
     kernels = KernelSpecManager(kernel_dirs=[str(tmp_path / "kernels")])
     notebook = jupytext.read(file)
