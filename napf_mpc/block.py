@@ -11,13 +11,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from napf_mpc import store
+from napf_mpc.closed_loop import Scenario, build_scenario, closed_loop
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import MissionScore, Score
 from napf_mpc.planners.planner import Planner
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.record import TrajectoryRecorder
-from napf_mpc.simulate import Scenario, build_scenario, closed_loop
 from napf_mpc.words import shown_value
 
 MAX_RUNS = 10_000_000

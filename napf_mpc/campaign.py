@@ -15,11 +15,11 @@ from typing import Any
 from napf_mpc import store
 from napf_mpc.block import Block, Missions, check_campaign, fly_block, simulate
 from napf_mpc.campaign_folder import Blocks, conclude, taken
+from napf_mpc.closed_loop import Scenario, build_scenario
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.provenance import identity, versions
 from napf_mpc.scenario_file import write_scenario
-from napf_mpc.simulate import Scenario, build_scenario
 from napf_mpc.summary import summarise
 from napf_mpc.workers import in_workers
 

@@ -9,6 +9,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.closed_loop import POSITION, VELOCITY, Flight, Mask, Scenario, formation_mission
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.jit import compiled
 from napf_mpc.navigation.consistency import normalised_errors
@@ -16,7 +17,6 @@ from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.planner import Command
 from napf_mpc.problem import Problem
 from napf_mpc.safety_distance import Inflation
-from napf_mpc.simulate import POSITION, VELOCITY, Flight, Mask, Scenario, formation_mission
 from napf_mpc.vehicle.quadrotor import hover_input
 from napf_mpc.world.distance import COS, SIN, Solids, X, Y, solid_bounds
 from napf_mpc.world.sweep import SweptClearance, swept_separation

@@ -412,7 +412,7 @@ class Forest(_Section):
 
 
 class StreetCanyon(_Section):
-    """A synthetic street: buildings of random size on both sides, masts and bridges in it."""
+    """A synthetic street: buildings of random size on both sides, masts in it."""
 
     kind: Literal["street_canyon"]
     """Kind of world."""
@@ -593,7 +593,7 @@ class Planner(_Section):
     influence_m: float = Field(3.0, ge=0.01, le=1e3)
     """rho_0: the potential field acts inside this distance (Eq. 23)."""
     repulsive_gain: float = Field(15.0, ge=0.0, le=1e6)
-    """k_r of Eq. 23."""
+    """k_r of Eq. 23 [m^4/s]."""
     min_distance_m: float = Field(0.1, ge=1e-3, le=1e2)
     """Distances below this count as this in Eq. 28: the force stays finite at contact."""
     max_turn_deg: float = Field(60.0, ge=0.0, le=90.0)
@@ -722,7 +722,7 @@ class Problem(_Section):
         if isinstance(self.mission, GoalMission) or fixes <= MAX_FIXES:
             return []
         return [
-            f"{self.uav_count} UAVs, simulation.time_limit_s = {limit_s:g} and navigation.rate_hz = {rate_hz:g}"
+            f"{self.uav_count} UAVs, simulation.time_limit_s = {limit_s:g}, navigation.rate_hz = {rate_hz:g}"
             f" make {fixes:.3g} position fixes a run, must be <= {MAX_FIXES:.3g}: lower one of the three"
         ]
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.closed_loop import ATTITUDE, POSITION, RATES, VELOCITY, Mask
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.planner import Command
-from napf_mpc.simulate import ATTITUDE, POSITION, RATES, VELOCITY, Mask
 
 Array = NDArray[np.float64]
 

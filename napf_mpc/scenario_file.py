@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc import store
+from napf_mpc.closed_loop import initial_state
 from napf_mpc.errors import DataError
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.goal_walk import goal_scenes
 from napf_mpc.problem import FormationMission, Problem
-from napf_mpc.simulate import initial_state
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.scenes import build_scenes
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere

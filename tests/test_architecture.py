@@ -24,7 +24,7 @@ FLOORS: list[set[str]] = [
     {"block"},
     {"summary", "record", "provenance"},
     {"evaluate"},
-    {"simulate"},
+    {"closed_loop"},
     {"planners"},
     {"apf"},
     {"safety_distance"},

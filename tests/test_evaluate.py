@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from napf_mpc.closed_loop import POSITION, Flight, build_scenario, formation_mission
 from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import Problem
-from napf_mpc.simulate import POSITION, Flight, build_scenario, formation_mission
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from napf_mpc.campaign import compare, fly_block, simulate
+from napf_mpc.closed_loop import POSITION, Scenario, build_scenario, closed_loop
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
 from napf_mpc.navigation.fix import Fix, diagonal
@@ -21,7 +22,6 @@ from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.record import TrajectoryRecorder
-from napf_mpc.simulate import POSITION, Scenario, build_scenario, closed_loop
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Shape, Sphere
 
@@ -162,7 +162,7 @@ def test_nobody_who_flies_looks_at_the_truth(
     plain, track = fly(problem, make_planner(planner, problem), scenario, 5)
 
     watch = Watch()
-    loop = import_module("napf_mpc.simulate")
+    loop = import_module("napf_mpc.closed_loop")
     inner_loop, advance = loop._inner_loop, loop.advance
 
     def move(state: Array, *rest: Any) -> None:

@@ -52,13 +52,27 @@ class NavSolution:
         return np.asarray(sigma[:, i] + sigma[:, j] - cross - cross.transpose(0, 2, 1))
 
     def trusted(self) -> NDArray[np.bool_]:
-        """(run, uav): a fix is there, all numbers are finite, and every position variance is positive.
+        """(run, uav): a fix is there, all numbers are finite, and the covariance of the position is one.
 
-        A variance of zero, a negative one or NaN means "unknown", never "certain": such a solution is not
-        to be planned with.
+        A variance of zero, a negative one or NaN means "unknown", never "certain", and so does a matrix with
+        a negative eigenvalue: such a solution is not to be planned with.
         """
         finite = np.isfinite(self.position).all(-1) & np.isfinite(self.velocity).all(-1)
         finite &= np.isfinite(self.attitude).all(-1) & np.isfinite(self.body_rates).all(-1)
         finite &= np.isfinite(self.covariance).all((-1, -2))
         variances = np.einsum("...ii->...i", self.position_covariance)
-        return np.asarray(self.available & finite & (variances > 0.0).all(-1))
+        sound = (variances > 0.0).all(-1) & _semidefinite(self.position_covariance)
+        return np.asarray(self.available & finite & sound)
+
+
+def _semidefinite(c: Array) -> NDArray[np.bool_]:
+    """Whether 3x3 matrices (..., 3, 3) have no negative eigenvalue beyond rounding, by their minors."""
+    xy, xz, yz = (0.5 * (c[..., i, j] + c[..., j, i]) for i, j in ((0, 1), (0, 2), (1, 2)))
+    x, y, z = c[..., 0, 0], c[..., 1, 1], c[..., 2, 2]
+    # Each minor is measured against the product of its variances, whatever their unit's size.
+    with np.errstate(invalid="ignore", over="ignore"):
+        slack = 1e-9
+        sound = xy * xy <= x * y * (1.0 + slack)
+        sound &= (xz * xz <= x * z * (1.0 + slack)) & (yz * yz <= y * z * (1.0 + slack))
+        determinant = x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz)
+        return np.asarray(sound & (determinant >= -slack * x * y * z))

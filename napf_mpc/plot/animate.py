@@ -16,6 +16,7 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 from PIL import Image
 
+from napf_mpc.closed_loop import formation_mission
 from napf_mpc.errors import OutputError
 from napf_mpc.formation import PathFrame
 from napf_mpc.plot import scene
@@ -32,7 +33,6 @@ from napf_mpc.plot.style import (
 from napf_mpc.plot.tracks import Track, acting, contacts, first_run, inflation_of, track
 from napf_mpc.problem import Problem
 from napf_mpc.safety_distance import Inflation
-from napf_mpc.simulate import formation_mission
 from napf_mpc.store import output_folder, write_bytes
 from napf_mpc.world.obstacles import ObstacleSet
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from napf_mpc.closed_loop import formation_mission
 from napf_mpc.formation import PathFrame
 from napf_mpc.plot import scene
 from napf_mpc.plot.space import space_figure
@@ -39,7 +40,6 @@ from napf_mpc.plot.tracks import (
 )
 from napf_mpc.problem import Problem
 from napf_mpc.safety_distance import Inflation
-from napf_mpc.simulate import formation_mission
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]

@@ -8,6 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from napf_mpc.block import fly_block
+from napf_mpc.closed_loop import build_scenario
 from napf_mpc.goal_walk import goal_scenes
 from napf_mpc.plot.field import surface_figure, walk_figure
 from napf_mpc.plot.flight import paths_figure, run_figures
@@ -15,7 +16,6 @@ from napf_mpc.plot.states import angle_figure, axis_figure
 from napf_mpc.plot.style import house_style, save
 from napf_mpc.plot.tracks import Track, track
 from napf_mpc.problem import GoalMission, Problem
-from napf_mpc.simulate import build_scenario
 
 EVERY = 5
 """Ticks of the inner loop between two drawn samples (0.1 s at 50 Hz)."""

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from scipy.stats import chi2
 
 from napf_mpc.campaign import fly_block, simulate
+from napf_mpc.closed_loop import ATTITUDE, POSITION, RATES, VELOCITY, build_scenario, closed_loop
 from napf_mpc.navigation import cross_covariance, kalman
 from napf_mpc.navigation.consistency import normalised_errors
 from napf_mpc.navigation.error_models import gauss_markov_errors, position_errors
@@ -26,7 +27,6 @@ from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Problem, Recorded
 from napf_mpc.problem_file import load_problem
-from napf_mpc.simulate import ATTITUDE, POSITION, RATES, VELOCITY, build_scenario, closed_loop
 from napf_mpc.streams import NormalSequence, Stream, normals
 
 Array = NDArray[np.float64]

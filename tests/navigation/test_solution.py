@@ -44,6 +44,31 @@ def test_zero_or_negative_variance_is_unknown_not_certain(axis: int, variance: f
     assert nav.trusted().sum() == RUNS * UAVS - 1
 
 
+@pytest.mark.parametrize(
+    "block",
+    [
+        [[1.0, 5.0, 0.0], [5.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        [[1.0, 0.0, 0.0], [0.0, 1e-6, 2e-6], [0.0, 2e-6, 1e-6]],
+        [[1.0, 0.9, 0.9], [0.9, 1.0, 0.0], [0.9, 0.0, 1.0]],  # only the determinant shows it
+    ],
+)
+def test_a_covariance_with_a_negative_eigenvalue_is_unknown_not_certain(block: list[list[float]]):
+    """Along some direction it would claim a sigma of zero or less."""
+    assert np.linalg.eigvalsh(np.array(block)).min() < 0.0
+    covariance = np.tile(np.eye(6), (RUNS, UAVS, 1, 1))
+    covariance[0, 0, :3, :3] = block
+    trusted = solution(covariance=covariance).trusted()
+    assert not trusted[0, 0]
+    assert trusted.sum() == RUNS * UAVS - 1
+
+
+def test_a_covariance_without_spread_in_one_direction_is_trusted():
+    """A singular matrix is no fault: two axes may be wholly correlated."""
+    covariance = np.tile(np.eye(6), (RUNS, UAVS, 1, 1))
+    covariance[0, 0, :3, :3] = np.outer([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
+    assert solution(covariance=covariance).trusted().all()
+
+
 def test_velocity_may_be_error_free():
     """Zero velocity variance is what a model with true velocities reports; only position is inflated."""
     assert (solution().covariance[..., 3:, 3:] == 0.0).all()

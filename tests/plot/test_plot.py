@@ -23,6 +23,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from napf_mpc.block import Block, fly_block
+from napf_mpc.closed_loop import build_scenario
 from napf_mpc.errors import DataError, OutputError, ProblemError
 from napf_mpc.goal_walk import goal_scenes, walk_to_goal
 from napf_mpc.plot import (
@@ -47,7 +48,6 @@ from napf_mpc.plot.tracks import SUBSTEPS, Track, acting, clearances, contacts, 
 from napf_mpc.problem import City, Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.provenance import identity
-from napf_mpc.simulate import build_scenario
 from napf_mpc.summary import summarise
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Sphere

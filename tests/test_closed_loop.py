@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from napf_mpc.campaign import fly_block, simulate
+from napf_mpc.closed_loop import POSITION, VELOCITY, Scenario, build_scenario, closed_loop, initial_state
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
 from napf_mpc.formation import PathFrame, formation_offsets
@@ -21,7 +22,6 @@ from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.record import TrajectoryRecorder
-from napf_mpc.simulate import POSITION, VELOCITY, Scenario, build_scenario, closed_loop, initial_state
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
