@@ -26,6 +26,9 @@ FLOORS: list[set[str]] = [
     {"evaluate"},
     {"closed_loop"},
     {"planners"},
+    {"solvers"},
+    {"qp"},
+    {"quadratic_program", "constraints"},
     {"apf"},
     {"safety_distance"},
     {"navigation"},
@@ -41,6 +44,9 @@ FLOORS: list[set[str]] = [
 
 HOMES = {
     "fcl": {"world/audit.py"},
+    "osqp": {"solvers/osqp_.py"},
+    "cvxpy": {"solvers/cvxpy_.py"},
+    "qpsolvers": {"solvers/qpsolvers_.py"},
     "numba": {"jit.py"},
     "casadi": {"vehicle/quadrotor.py", "vehicle/codegen.py"},
     "pymap3d": {"navigation/recorded.py", "world/city.py"},

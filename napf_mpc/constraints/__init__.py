@@ -1,0 +1,1 @@
+"""Constraints of the QP planner: rows in metres, m/s or radians."""

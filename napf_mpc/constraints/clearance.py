@@ -1,0 +1,276 @@
+r"""NAPF's repulsion as rows of a QP: keep clear of obstacles, inflated by the navigation error (section 3.2).
+
+Around the last plan's position p_lin of a stage the shifted distance to an obstacle,
+
+    rho_bar(p) = d(p_lin) + n^T (p - p_lin) - r_uav - k sqrt(n^T Sigma n),
+
+is linear in p: d the signed distance to the surface and n its unit gradient. Outside a convex obstacle the
+half-space holds none of it, so a row that is kept is never a mistake; for a prism with a courtyard it speaks
+of the nearest wall. Two shells of rows are made of it: contact, ``rho_bar >= 0``, whose penalty is exact, and
+influence, ``rho_bar >= rho_0``, whose penalty pulls like NAPF.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc import apf
+from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
+from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins
+from napf_mpc.safety_distance import Inflation
+from napf_mpc.world.distance import CYLINDER, SPHERE, A
+
+Array = NDArray[np.float64]
+Margin = Literal["half_space", "exact"]
+
+CONTACT_W1 = 1000.0
+"""Linear price of a contact slack [1/(m s)].
+
+It has to beat the multiplier of the row, or the plan buys its way in. A row that holds a UAV e metres off a
+slot for T seconds with a position weight q carries at most q e T in all; spent on a single stage of h
+seconds that is a price of q e T / h per second. With q = 0.1, e = 12 m, T = 8 s and h = 0.1 s: about 100. Ten
+times that leaves room for other weights, and is still an order below what spoils OSQP's convergence.
+"""
+CONTACT_W2 = 100.0
+"""Quadratic price of a contact slack [1/(m^2 s)]: spreads what cannot be met over the stages."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """The M obstacles of each stage that are nearest by shifted distance, in the order of their indices."""
+
+    distance: Array
+    """(run, uav, N, M) from surface to surface: signed distance less the UAV's radius; +inf without [m]."""
+    normal: Array
+    """(run, uav, N, M, 3) unit gradient of the distance; zero without."""
+    margin: Array
+    """(run, uav, N, M) k sigma [m]."""
+    shifted: Array
+    """(run, uav, N, M) distance that enters the potential field, rho_bar; +inf without [m]."""
+    influence: Array
+    """(run, uav, N, M) range of influence rho_0, widened if the inflation asks for that [m]."""
+
+    @classmethod
+    def of(
+        cls, horizon: Horizon, inflation: Inflation, count: int, reach_m: float, margin: Margin = "half_space"
+    ) -> Gaps:
+        """Gaps along the last plans.
+
+        Parameters
+        ----------
+        horizon : Horizon
+            Plans, covariance and map.
+        inflation : Inflation
+            How k sigma enters.
+        count : int
+            M.
+        reach_m : float
+            Obstacles with a shifted distance of this or more count as none [m].
+        margin : "half_space" or "exact"
+            Margin against a flat wall, or against the sphere or cylinder that is there.
+        """
+        runs, uavs, stages = horizon.shape
+        radius, rho_0 = horizon.problem.vehicle.radius_m, horizon.problem.planner.influence_m
+        reach = reach_m + radius + inflation.largest_margin(horizon.covariance)
+        # An obstacle a little farther off may act more where the error is larger in its direction.
+        near = horizon.obstacles.near(
+            horizon.position.reshape(runs, uavs * stages, 3), reach.reshape(runs, uavs * stages), 2 * count
+        )
+        shape = (runs, uavs, stages, 2 * count)
+        distance = near.distance.reshape(shape) - radius
+        normal, index = near.gradient.reshape(*shape, 3), near.index.reshape(shape)
+        if margin == "exact":
+            size = _exact(horizon, index, normal, inflation.k)
+        else:
+            size = inflation.margin(horizon.covariance, normal)
+        shifted, influence = inflation.apply(distance, size, rho_0)
+        rank = distance - size
+        none = ~(rank < reach_m)
+        chosen = np.argsort(np.where(none, np.inf, rank), axis=-1, kind="stable")[..., :count]
+        # Rows that keep their places from stage to stage and step to step keep a warm start warm.
+        named = np.where(none, np.iinfo(np.int64).max, index)
+        order = np.argsort(np.take_along_axis(named, chosen, -1), axis=-1, kind="stable")
+        chosen = np.take_along_axis(chosen, order, -1)
+        distance, size, shifted, influence = (
+            np.take_along_axis(values, chosen, -1)
+            for values in (np.where(none, np.inf, distance), size, np.where(none, np.inf, shifted), influence)
+        )
+        normal = np.take_along_axis(np.where(none[..., None], 0.0, normal), chosen[..., None], -2)
+        return cls(distance, normal, size, shifted, influence)
+
+    def rows_beyond(self, position: Array, distance: Array | float) -> tuple[Array, Array]:
+        """Coefficients and lower bounds of rows "shifted distance >= distance" on the position."""
+        along = np.zeros(self.shifted.shape)
+        for axis in range(3):
+            along += self.normal[..., axis] * position[..., None, axis]
+        return self.normal, along + (distance - self.shifted)
+
+
+def _exact(horizon: Horizon, index: NDArray[np.int64], normal: Array, k: float) -> Array:
+    """Margins (run, uav, N, m) against the spheres and cylinders that are there."""
+    world = horizon.obstacles
+    if len(world) == 0:
+        return np.zeros(index.shape)
+    first = world.scene_start[:-1] if world.n_scenes > 1 else world.scene_start[:1]
+    place = np.where(index >= 0, index + first[:, None, None, None], 0)
+    solids, shape = world.solids.kind[place], world.solids.parameters[place]
+    # Beside its wall a cylinder is taken for an endless one; near its roof it is a wall like any other.
+    beside = (solids == CYLINDER) & (normal[..., 2] == 0.0)
+    kind = np.where(solids == SPHERE, BALL, np.where(beside, DISC, HALF_SPACE))
+    margin = np.empty(index.shape)
+    points, m = index[..., 0].size, index.shape[-1]
+    exact_margins(
+        kind.reshape(points, m),
+        (shape[..., A] + horizon.problem.vehicle.radius_m).reshape(points, m),
+        np.ascontiguousarray(normal).reshape(points, m, 3),
+        np.ascontiguousarray(horizon.covariance).reshape(points, 3, 3),
+        k,
+        margin.reshape(points, m),
+    )
+    return margin
+
+
+@dataclass(frozen=True)
+class _Shell:
+    inflation: Inflation | None = None
+    """How k sigma enters; by default as the problem's planner section says."""
+    obstacles: int = 4
+    """Rows of each stage M."""
+    reach_m: float = 10.0
+    """Obstacles with a shifted distance of this or more are left out [m]."""
+    margin: Margin = "half_space"
+    """``half_space`` is exact for a wall and careful elsewhere; ``exact`` asks for the same chance of a hit,
+    at each time and obstacle, of the sphere or cylinder itself. Small obstacles then take less room, and use
+    up the whole of what is asked: bound the mission's risk with it, not the step's."""
+
+    def __post_init__(self) -> None:
+        if self.obstacles < 1 or not self.reach_m > 0.0:
+            raise ConstraintError(
+                f"obstacles = {self.obstacles!r} and reach_m = {self.reach_m!r}: must be >= 1 and > 0"
+            )
+        if self.margin not in get_args(Margin):
+            raise ConstraintError(f"margin = {self.margin!r}, must be one of {', '.join(get_args(Margin))}")
+
+    def gaps(self, horizon: Horizon, least_reach_m: float = 0.0) -> Gaps:
+        """Nearest obstacles of each stage."""
+        inflation = self.inflation or Inflation.of_planner(horizon.problem.planner)
+        if self.margin == "exact" and inflation.reading not in ("directional", "chi2"):
+            raise ConstraintError(
+                f'margin = "exact" uses the whole covariance; inflation.reading = "{inflation.reading}" '
+                'does not go with it, choose "directional" or "chi2"'
+            )
+        asked = (inflation, self.obstacles, max(self.reach_m, least_reach_m), self.margin)
+        if asked not in horizon.memo:
+            horizon.memo[asked] = Gaps.of(horizon, *asked)
+        gaps: Gaps = horizon.memo[asked]
+        return gaps
+
+
+@dataclass(frozen=True)
+class ObstacleContact(_Shell):
+    """Contact shell: stay k sigma clear of the surface, ``rho_bar >= extra``.
+
+    Soft with an exact penalty: kept to the last micrometre where that can be done, and broken by as little as
+    possible where it cannot. The rows of one UAV and stage share one slack, in metres: the largest shortfall.
+    """
+
+    extra_m: float = 0.0
+    """Distance kept on top of the margin [m]."""
+    w1: float = CONTACT_W1
+    """Linear price of the slack [1/(m s)]."""
+    w2: float = CONTACT_W2
+    """Quadratic price of the slack [1/(m^2 s)]."""
+
+    @property
+    def name(self) -> str:
+        """Name in results and errors."""
+        return "obstacle contact"
+
+    def rows(self, horizon: Horizon) -> LinearRows:
+        """Rows ``n^T p >= n^T p_lin - rho_bar(p_lin) + extra - s`` [m]."""
+        jac, lower = self.gaps(horizon, self.extra_m).rows_beyond(horizon.position, self.extra_m)
+        slack = (*horizon.shape, 1)
+        return LinearRows(
+            "position", jac, lower, None, np.full(slack, self.w1), np.full(slack, self.w2), shared_slack=True
+        )
+
+
+@dataclass(frozen=True)
+class ObstacleInfluence(_Shell):
+    r"""Influence shell: NAPF's repulsion inside rho_0, as a quadratic penalty on ``rho_bar >= rho_0 - s``.
+
+    The weight is FIRAS's force over the remaining distance, frozen at the last plan,
+
+        w2 = c k_r (1/rho - 1/rho_0) / rho^2 / (rho_0 - rho_bar) = c k_r / (rho_0 rho_bar^3),
+
+    rho being rho_bar, but at least the least distance of Eq. 28. At the last plan the slack is
+    rho_0 - rho_bar, so that minus the gradient of w2 s^2 / 2 by the position is c times NAPF's force along n:
+    its magnitude (Eq. 28), its direction (Eq. 29) and, over the rows, its sum (Eq. 36). Beyond rho_0, where
+    NAPF does nothing, w2 is the slope of the force at rho_0: it counts only once a plan comes nearer.
+    """
+
+    per_speed: float = 1.0
+    """Unit factor c: price per metre and second for each m/s of NAPF's velocity [1/(m s) per m/s]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (math.isfinite(self.per_speed) and self.per_speed > 0.0):
+            raise ConstraintError(f"per_speed = {self.per_speed!r}, must be > 0")
+
+    @property
+    def name(self) -> str:
+        """Name in results and errors."""
+        return "obstacle influence"
+
+    def rows(self, horizon: Horizon) -> LinearRows:
+        """Rows ``n^T p >= n^T p_lin - rho_bar(p_lin) + rho_0 - s`` [m], each with a slack of its own."""
+        settings = horizon.problem.planner
+        gaps = self.gaps(horizon, settings.influence_m)
+        jac, lower = gaps.rows_beyond(horizon.position, gaps.influence)
+        w2 = self.per_speed * influence_weight(
+            gaps.shifted, settings.repulsive_gain, gaps.influence, settings.min_distance_m
+        )
+        free = w2 <= 0.0
+        return LinearRows(
+            "position",
+            jac,
+            np.where(free, -np.inf, lower),
+            None,
+            np.zeros(w2.shape),
+            # A slack without a price would be undetermined; this one's row is switched off.
+            np.where(free, 1.0, w2),
+        )
+
+
+def influence_weight(rho: Array, gain: float, influence_m: Array | float, floor_m: float) -> Array:
+    """Stiffness of the repulsion: FIRAS's force over the remaining distance (Eq. 28).
+
+    Parameters
+    ----------
+    rho : array, shape (...)
+        Shifted distance rho_bar [m].
+    gain : float
+        k_r.
+    influence_m : array or float, shape (...)
+        rho_0 [m].
+    floor_m : float
+        Least distance [m].
+
+    Returns
+    -------
+    array, shape (...)
+        k_r / (rho_0 rho^3) between the least distance and rho_0, no 0/0 at rho_0; the force at the least
+        distance over rho_0 - rho below it; k_r / rho_0^4 beyond rho_0.
+    """
+    held = np.clip(rho, floor_m, influence_m)
+    remaining = np.where(rho < floor_m, influence_m - np.minimum(rho, floor_m), 1.0)
+    return np.where(
+        rho < floor_m,
+        apf.repulsion(held, gain, influence_m, floor_m) / remaining,
+        gain / (influence_m * held**3),
+    )

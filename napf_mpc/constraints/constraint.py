@@ -1,0 +1,242 @@
+"""What a constraint is: one method that returns rows on a named signal, for all UAVs and stages at once."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.errors import NapfError
+from napf_mpc.formation import PathFrame
+from napf_mpc.problem import Problem
+from napf_mpc.world.obstacles import ObstacleSet
+
+Array = NDArray[np.float64]
+
+SIGNALS: dict[str, tuple[int, ...]] = {
+    "position": (0, 2, 4),
+    "velocity": (1, 3, 5),
+    "attitude": (6, 8, 10),
+    "input": (0, 1, 2, 3),
+}
+"""Name of a signal -> its places in the state (Eq. 1), or in the input about hover (Eq. 2)."""
+
+
+class ConstraintError(NapfError, ValueError):
+    """Rows do not fit the horizon, or hold numbers that are not finite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Horizon:
+    """What a constraint may look at: the last plan, the reported covariance along it, the map.
+
+    All numbers are finite: a planner stands in for a UAV whose navigation it does not trust before it asks
+    for rows.
+    """
+
+    time_s: float
+    """Time now [s]."""
+    step_s: Array
+    """(N,) length of each stage [s]."""
+    position: Array
+    """(run, uav, N, 3) positions at the end of each stage by the last plans: rows are linear there [m]."""
+    velocity: Array
+    """(run, uav, N, 3) velocities of the same plans [m/s]."""
+    covariance: Array
+    """(run, uav, N, 3, 3) reported position covariance, propagated to each stage [m^2]."""
+    common_factor: Array
+    """(run, uav, 3, rank) factor of the part of the covariance that UAVs share now [m]."""
+    obstacles: ObstacleSet
+    """One scene for all runs, or one a run."""
+    frame: PathFrame
+    """Frame of the mission's path."""
+    problem: Problem
+    """Sizes, speeds and settings."""
+    memo: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
+    """Answers that several constraints share, such as the nearest obstacles; dies with the horizon."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(run, uav, N)."""
+        runs, uavs, stages = self.position.shape[:3]
+        return runs, uavs, stages
+
+    def check(self) -> None:
+        """Refuse a horizon whose arrays do not fit each other or are not finite.
+
+        Raises
+        ------
+        ConstraintError
+            Naming everything that is wrong.
+        """
+        faults = []
+        shape = self.position.shape[:3]
+        rank = self.common_factor.shape[-1] if self.common_factor.ndim else 0
+        expected = {
+            "step_s": shape[2:],
+            "position": (*shape, 3),
+            "velocity": (*shape, 3),
+            "covariance": (*shape, 3, 3),
+            "common_factor": (*shape[:2], 3, rank),
+        }
+        for name, want in expected.items():
+            values = getattr(self, name)
+            if values.shape != want:
+                faults.append(f"{name} has shape {values.shape}, must be {want}")
+            elif not np.isfinite(values).all():
+                faults.append(f"{name} has an entry that is not finite")
+        if not faults and not (self.step_s > 0.0).all():
+            faults.append("step_s must be > 0")
+        if len(shape) == 3 and self.obstacles.n_scenes not in (1, shape[0]):
+            faults.append(
+                f"{shape[0]} runs do not fit {self.obstacles.n_scenes} scenes: one each, or one for all"
+            )
+        if faults:
+            raise ConstraintError("horizon: " + "; ".join(faults))
+
+
+@dataclass(frozen=True, eq=False)
+class LinearRows:
+    """Rows ``lower <= jac . signal <= upper`` of every run, UAV and stage, hard or soft.
+
+    A soft row may be violated by a slack s >= 0 in its own unit at the price of
+    ``w1 s + w2 s^2 / 2`` per second. The number of rows is the same every step; an inactive row carries
+    infinite bounds.
+    """
+
+    signal: str
+    """A name of :data:`SIGNALS`: states at the end of a stage, inputs during it."""
+    jac: Array
+    """(run, uav, N, m, dim) coefficients on the signal."""
+    lower: Array | None = None
+    """(run, uav, N, m) in the unit of jac . signal; None if no row of this kind has a lower bound."""
+    upper: Array | None = None
+    """(run, uav, N, m); None if no row of this kind has an upper bound."""
+    w1: Array | None = None
+    """(run, uav, N, m) linear slack penalty per unit and second; None for hard rows."""
+    w2: Array | None = None
+    """(run, uav, N, m) quadratic slack penalty per unit squared and second; None for hard rows."""
+    shared_slack: bool = False
+    """Whether the rows of a stage share one slack; w1 and w2 are then (run, uav, N, 1)."""
+
+    @property
+    def soft(self) -> bool:
+        """Whether the rows may be violated at a price."""
+        return self.w1 is not None
+
+    @property
+    def count(self) -> int:
+        """Rows of each stage m."""
+        return int(self.jac.shape[3])
+
+    @property
+    def slack_count(self) -> int:
+        """Slacks of each stage."""
+        return 0 if not self.soft else 1 if self.shared_slack else self.count
+
+    def values(self, signal: Array) -> Array:
+        """Return jac . signal of a signal (run, uav, N, dim), shape (run, uav, N, m)."""
+        total = np.zeros(self.jac.shape[:-1])
+        # One axis after the other: a contraction by BLAS may differ in the last bit with the batch.
+        for axis in range(self.jac.shape[-1]):
+            total += self.jac[..., axis] * signal[..., None, axis]
+        return total
+
+    def violation(self, signal: Array) -> Array:
+        """Return how far a signal (run, uav, N, dim) is outside each row's bounds, >= 0, (run, uav, N, m)."""
+        values = self.values(signal)
+        over = np.zeros_like(values)
+        if self.lower is not None:
+            over = np.maximum(over, self.lower - values)
+        if self.upper is not None:
+            over = np.maximum(over, values - self.upper)
+        return over
+
+    def shifted(self, origin: Array) -> LinearRows:
+        """Return the rows for a signal measured from an origin (run, uav, dim)."""
+        offset = self.values(origin[:, :, None])
+        return LinearRows(
+            self.signal,
+            self.jac,
+            None if self.lower is None else self.lower - offset,
+            None if self.upper is None else self.upper - offset,
+            self.w1,
+            self.w2,
+            self.shared_slack,
+        )
+
+    def check(self, shape: tuple[int, int, int]) -> None:
+        """Refuse rows that do not fit a horizon of shape (run, uav, N).
+
+        Raises
+        ------
+        ConstraintError
+            Naming everything that is wrong.
+        """
+        faults = [*self._shape_faults(shape)]
+        if not faults:
+            faults = [*self._value_faults()]
+        if faults:
+            raise ConstraintError("; ".join(faults))
+
+    def _shape_faults(self, shape: tuple[int, int, int]) -> Iterator[str]:
+        if self.signal not in SIGNALS:
+            yield f"signal {self.signal!r} is not known; choose from {', '.join(SIGNALS)}"
+            return
+        want = (*shape, self.jac.shape[3] if self.jac.ndim == 5 else -1)
+        if self.jac.shape != (*want, len(SIGNALS[self.signal])):
+            dims = (*shape, "m", len(SIGNALS[self.signal]))
+            yield f"jac has shape {self.jac.shape}, must be (run, uav, N, m, dim) = {dims}"
+        slack = (*shape, 1) if self.shared_slack else want
+        arrays = (
+            ("lower", self.lower, want),
+            ("upper", self.upper, want),
+            ("w1", self.w1, slack),
+            ("w2", self.w2, slack),
+        )
+        for name, values, expected in arrays:
+            if values is not None and values.shape != expected:
+                yield f"{name} has shape {values.shape}, must be {expected}"
+        if (self.w1 is None) != (self.w2 is None):
+            yield "give both of w1 and w2 (soft rows) or neither (hard rows)"
+        if self.shared_slack and not self.soft:
+            yield "hard rows share no slack: give w1 and w2, or drop shared_slack"
+        if self.lower is None and self.upper is None:
+            yield "give lower, upper or both"
+
+    def _value_faults(self) -> Iterator[str]:
+        if not np.isfinite(self.jac).all():
+            yield "jac has an entry that is not finite"
+        for name, bound in (("lower", self.lower), ("upper", self.upper)):
+            if bound is not None and np.isnan(bound).any():
+                yield f"{name} has a NaN"
+        if self.lower is not None and (self.lower == np.inf).any():
+            yield "lower has +inf"
+        if self.upper is not None and (self.upper == -np.inf).any():
+            yield "upper has -inf"
+        if self.lower is not None and self.upper is not None and (self.lower > self.upper).any():
+            yield "lower > upper somewhere"
+        for name, weights in (("w1", self.w1), ("w2", self.w2)):
+            if weights is not None and not ((weights >= 0.0) & np.isfinite(weights)).all():
+                yield f"{name} has an entry that is negative or not finite"
+        if self.w1 is not None and self.w2 is not None and not (self.w1 + self.w2 > 0.0).all():
+            yield "a slack is free of charge: w1 + w2 must be > 0, of inactive rows too"
+
+
+class Constraint(Protocol):
+    """A block of rows. Its author never sees a column index.
+
+    Hold a new one against :func:`napf_mpc.constraints.contract.check_constraint`.
+    """
+
+    @property
+    def name(self) -> str:
+        """Name in results and errors."""
+        ...
+
+    def rows(self, horizon: Horizon) -> LinearRows:
+        """Rows of all runs, UAVs and stages; called once a step. Signal, shapes and kind never change."""
+        ...

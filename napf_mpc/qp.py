@@ -1,0 +1,358 @@
+"""The quadratic programs of many UAVs over a horizon: model, references, rows -> matrices of a fixed layout.
+
+The planner thinks in a :class:`HorizonQp`: model, references and rows on named signals, for every (run, UAV)
+at once. A general solver sees one :class:`~napf_mpc.quadratic_program.QuadraticProgram` a UAV. A
+:class:`Layout` says where each number of the one stands in the other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from napf_mpc.constraints.constraint import SIGNALS, ConstraintError, LinearRows
+from napf_mpc.quadratic_program import (
+    Array,
+    Index,
+    QpError,
+    QpResult,
+    QpStatus,
+    QuadraticProgram,
+    Residuals,
+    Sparsity,
+    Values,
+)
+
+__all__ = [
+    "INPUTS",
+    "STATES",
+    "Array",
+    "HorizonModel",
+    "HorizonQp",
+    "Index",
+    "Layout",
+    "QpError",
+    "QpResult",
+    "QpStatus",
+    "QuadraticProgram",
+    "Residuals",
+    "Sparsity",
+    "Values",
+]
+
+STATES, INPUTS = 12, 4
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonModel:
+    """Linear model about hover and weights on a stage grid, shared by all runs and UAVs."""
+
+    step_s: Array
+    """(N,) length of each stage [s]."""
+    a: Array
+    """(N, 12, 12) exact zero-order hold of each stage."""
+    b: Array
+    """(N, 12, 4)."""
+    q: Array
+    """(N, 12, 12) weight of the state at the end of each stage; the last is the terminal weight."""
+    r: Array
+    """(N, 4, 4) weight of the input about hover during each stage."""
+
+    @property
+    def stages(self) -> int:
+        """Number of stages N."""
+        return len(self.step_s)
+
+    @property
+    def times_s(self) -> Array:
+        """(N,) time from now at the end of each stage [s]."""
+        return np.cumsum(self.step_s)
+
+    def check(self) -> None:
+        """Refuse shapes that do not fit, numbers that are not finite, and weights that are not convex.
+
+        Raises
+        ------
+        QpError
+            Naming everything that is wrong.
+        """
+        n = self.stages
+        want = {"a": (n, STATES, STATES), "b": (n, STATES, INPUTS), "q": (n, STATES, STATES)}
+        want["r"] = (n, INPUTS, INPUTS)
+        faults = [] if n else ["the horizon has no stages"]
+        for name, shape in want.items():
+            values = getattr(self, name)
+            if values.shape != shape:
+                faults.append(f"{name} has shape {values.shape}, must be {shape}")
+            elif not np.isfinite(values).all():
+                faults.append(f"{name} has an entry that is not finite")
+            elif name in "qr" and n:
+                size = 1e-9 * max(1.0, float(np.abs(values).max()))
+                if np.abs(values - values.swapaxes(1, 2)).max() > size:
+                    faults.append(f"{name} is not symmetric")
+                elif np.linalg.eigvalsh(values).min() < -size:
+                    faults.append(f"{name} has a negative eigenvalue")
+        if not (np.isfinite(self.step_s).all() and (self.step_s > 0.0).all()):
+            faults.append("a stage's length is not a positive number of seconds")
+        if faults:
+            raise QpError("; ".join(faults))
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonQp:
+    """The programs of all UAVs of all runs over one horizon."""
+
+    model: HorizonModel
+    """Dynamics and weights."""
+    initial: Array
+    """(run, uav, 12) state now."""
+    reference: Array
+    """(run, uav, N, 12) state to track at the end of each stage."""
+    rows: tuple[LinearRows, ...]
+    """Rows of all constraints, in a fixed order."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(run, uav, N)."""
+        runs, uavs, stages = self.reference.shape[:3]
+        return runs, uavs, stages
+
+    def check(self) -> None:
+        """Refuse a horizon whose parts do not fit or are not finite.
+
+        Raises
+        ------
+        QpError
+            Naming the part.
+        """
+        self.model.check()
+        self.check_shapes()
+        if not (np.isfinite(self.initial).all() and np.isfinite(self.reference).all()):
+            raise QpError("initial state or reference is not finite")
+        try:
+            for rows in self.rows:
+                rows.check(self.shape)
+        except ConstraintError as error:
+            raise QpError(str(error)) from error
+
+    def check_shapes(self) -> None:
+        """Refuse parts that do not fit, whatever their numbers.
+
+        Raises
+        ------
+        QpError
+            Naming the part.
+        """
+        if self.reference.ndim != 4 or self.reference.shape[3] != STATES:
+            raise QpError(f"reference has shape {self.reference.shape}, must be (run, uav, N, {STATES})")
+        runs, uavs, stages = self.shape
+        if self.initial.shape != (runs, uavs, STATES):
+            raise QpError(f"initial has shape {self.initial.shape}, must be {(runs, uavs, STATES)}")
+        if stages != self.model.stages:
+            raise QpError(f"reference has {stages} stages, the model has {self.model.stages}")
+        for k, block in enumerate(self.rows):
+            if block.signal not in SIGNALS:
+                raise QpError(f"rows[{k}]: signal {block.signal!r} is not known")
+            m, dim = block.count, len(SIGNALS[block.signal])
+            slack = (runs, uavs, stages, block.slack_count)
+            want = {"jac": (runs, uavs, stages, m, dim), "w1": slack, "w2": slack}
+            want |= {"lower": (runs, uavs, stages, m), "upper": (runs, uavs, stages, m)}
+            for name, shape in want.items():
+                values = getattr(block, name)
+                if values is not None and values.shape != shape:
+                    raise QpError(f"rows[{k}].{name} has shape {values.shape}, must be {shape}")
+
+    def assemble(self, run: int, uav: int) -> QuadraticProgram:
+        """Matrices of one UAV's program: states, inputs about hover, then slacks (see :class:`Layout`)."""
+        layout = Layout.of(self)
+        return QuadraticProgram.of_values(layout.sparsity, layout.values(self).of(run, uav))
+
+
+Kind = tuple[str, int, int, bool, bool]
+"""What the layout knows of a block: signal, rows and slacks a stage, whether it has lower, upper bounds."""
+Places = tuple[Index, Index, Index]
+"""Stage, row and column of the entries of a model's matrices that are not zero."""
+
+
+class _Entries:
+    """Places of a sparse matrix collected block by block, then brought into column-major order."""
+
+    def __init__(self) -> None:
+        self._rows: list[Index] = []
+        self._columns: list[Index] = []
+
+    def add(self, rows: Index, columns: Index) -> None:
+        rows, columns = np.broadcast_arrays(rows, columns)
+        self._rows.append(rows.ravel())
+        self._columns.append(columns.ravel())
+
+    def ordered(self) -> tuple[Index, Index, Index]:
+        rows, columns = np.concatenate(self._rows), np.concatenate(self._columns)
+        order = np.lexsort((rows, columns))
+        return rows[order], columns[order], order
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where everything stands in the matrices; fixed for a model and its kinds of rows.
+
+    Variables: states x_1 .. x_N, inputs u_0 .. u_{N-1}, then for each soft block its slacks, stage by stage.
+    Rows: dynamics, then for each block its lower side, its upper side (hard blocks: one row for both), and
+    ``s >= 0`` of its slacks. Entries of the model that are zero at all stages have no place: the hover model
+    falls into four chains, and a solver's factors shrink by half.
+    """
+
+    sparsity: Sparsity
+    """Places of the entries."""
+    slacks: tuple[slice, ...]
+    """Columns of each block's slacks; empty for hard rows."""
+    kinds: tuple[Kind, ...]
+    """Of the blocks of rows."""
+    stages: int
+    """Number of stages N."""
+    places: tuple[Places, Places, Places, Places]
+    """Entries of the model's a (of x_1 onwards), b, q and r that are not zero."""
+    p_order: Index
+    """Column-major order of P's numbers as :meth:`values` collects them."""
+    a_order: Index
+    """The same for A."""
+
+    @classmethod
+    def of(cls, horizon: HorizonQp) -> Layout:
+        """Layout of a horizon; depends on shapes, signals, kinds of slack and the model's zeros only."""
+        stages, kinds = horizon.model.stages, tuple(_kind(block) for block in horizon.rows)
+        places = _places(horizon.model)
+        (ak, ai, aj), (bk, bi, bj), (qk, qi, qj), (rk, ri, rj) = places
+        p, a = _Entries(), _Entries()
+        stage = np.arange(stages)[:, None]
+        state, at_input = STATES * stage, STATES * stages + INPUTS * stage
+        p.add(STATES * qk + qi, STATES * qk + qj)
+        p.add(STATES * stages + INPUTS * rk + ri, STATES * stages + INPUTS * rk + rj)
+        # x_{k+1} - A x_k - B u_k = 0; A x_0 is on the right-hand side.
+        every = np.arange(STATES * stages)
+        a.add(every, every)
+        a.add(STATES * (ak + 1) + ai, STATES * ak + aj)
+        a.add(STATES * bk + bi, STATES * stages + INPUTS * bk + bj)
+        columns, rows_so_far = (STATES + INPUTS) * stages, STATES * stages
+        slacks: list[slice] = []
+        for signal, count, per_stage, has_lower, has_upper in kinds:
+            target = (at_input if signal == "input" else state)[:, :, None] + np.array(SIGNALS[signal])
+            slack = columns + per_stage * stage + (np.arange(count) if per_stage == count else 0)
+            for _ in range(has_lower + has_upper if per_stage else 1):
+                row = rows_so_far + count * stage + np.arange(count)
+                a.add(row[:, :, None], target)
+                if per_stage:
+                    a.add(row, slack)
+                rows_so_far += count * stages
+            size = per_stage * stages
+            slacks.append(slice(columns, columns + size))
+            own = np.arange(columns, columns + size)
+            p.add(own, own)
+            a.add(rows_so_far + np.arange(size), own)
+            columns, rows_so_far = columns + size, rows_so_far + size
+        p_rows, p_columns, p_order = p.ordered()
+        a_rows, a_columns, a_order = a.ordered()
+        sparsity = Sparsity(columns, rows_so_far, p_rows, p_columns, a_rows, a_columns)
+        return cls(sparsity, tuple(slacks), kinds, stages, places, p_order, a_order)
+
+    def same_rows(self, horizon: HorizonQp) -> bool:
+        """Whether a horizon has the stages and kinds of rows of this layout."""
+        return self.stages == horizon.model.stages and self.kinds == tuple(_kind(b) for b in horizon.rows)
+
+    def fits(self, horizon: HorizonQp) -> bool:
+        """Whether the programs of a horizon have this layout: rows, and zeros of the model."""
+        return self.same_rows(horizon) and all(
+            np.array_equal(mine, theirs)
+            for pair, other in zip(self.places, _places(horizon.model), strict=True)
+            for mine, theirs in zip(pair, other, strict=True)
+        )
+
+    def values(self, horizon: HorizonQp) -> Values:
+        """Numbers of all programs of a horizon that has this layout."""
+        runs, uavs, stages = horizon.shape
+        model, batch = horizon.model, (runs, uavs)
+        at_a, at_b, at_q, at_r = self.places
+        p, a = [model.q[at_q], model.r[at_r]], [np.ones(STATES * stages), -model.a[1:][at_a], -model.b[at_b]]
+        p, a = ([np.broadcast_to(v, (*batch, v.size)) for v in values] for values in (p, a))
+        pull = np.zeros((*batch, stages, STATES))
+        start = np.zeros((*batch, stages, STATES))
+        # One state after the other: a library product may group its terms by the length of the batch.
+        for j in range(STATES):
+            pull -= model.q[:, :, j] * horizon.reference[..., j, None]
+            start[:, :, 0] += model.a[0, :, j] * horizon.initial[..., j, None]
+        q = [_flat(pull), np.zeros((*batch, INPUTS * stages))]
+        lower, upper = [_flat(start)], [_flat(start)]
+        duration = model.step_s[:, None]
+        for block in horizon.rows:
+            jac = _flat(block.jac)
+            for low, high, sign in _sides(block):
+                a.append(jac)
+                if block.soft:
+                    a.append(np.full((*batch, stages * block.count), sign))
+                lower.append(_bound(low, -np.inf, block))
+                upper.append(_bound(high, np.inf, block))
+            if block.w1 is not None and block.w2 is not None:
+                size = block.slack_count * stages
+                p.append(_flat(block.w2 * duration))
+                q.append(_flat(block.w1 * duration))
+                a.append(np.ones((*batch, size)))
+                lower.append(np.zeros((*batch, size)))
+                upper.append(np.full((*batch, size), np.inf))
+        return Values(
+            np.concatenate(p, axis=-1)[..., self.p_order],
+            np.concatenate(q, axis=-1),
+            np.concatenate(a, axis=-1)[..., self.a_order],
+            np.concatenate(lower, axis=-1),
+            np.concatenate(upper, axis=-1),
+        )
+
+    def states(self, z: Array) -> Array:
+        """States (..., N, 12) of primal points (..., n)."""
+        return z[..., : STATES * self.stages].reshape(*z.shape[:-1], self.stages, STATES)
+
+    def inputs(self, z: Array) -> Array:
+        """Inputs about hover (..., N, 4) of primal points (..., n)."""
+        part = z[..., STATES * self.stages : (STATES + INPUTS) * self.stages]
+        return part.reshape(*z.shape[:-1], self.stages, INPUTS)
+
+    def block_slacks(self, z: Array) -> tuple[Array, ...]:
+        """Slacks (..., N, slacks a stage) of each block of rows, of primal points (..., n)."""
+        return tuple(
+            z[..., columns].reshape(*z.shape[:-1], self.stages, kind[2])
+            for columns, kind in zip(self.slacks, self.kinds, strict=True)
+        )
+
+
+def _kind(block: LinearRows) -> Kind:
+    return block.signal, block.count, block.slack_count, block.lower is not None, block.upper is not None
+
+
+def _places(model: HorizonModel) -> tuple[Places, Places, Places, Places]:
+    def some(matrices: Array) -> Places:
+        stage, row, column = np.nonzero(matrices)
+        return stage, row, column
+
+    return some(model.a[1:]), some(model.b), some(model.q), some(model.r)
+
+
+def _flat(values: Array) -> Array:
+    """All axes after (run, uav) as one."""
+    return values.reshape(*values.shape[:2], math.prod(values.shape[2:]))
+
+
+def _sides(block: LinearRows) -> list[tuple[Array | None, Array | None, float]]:
+    """Bounds of each copy of a block's rows in A, and the sign of the slack in it."""
+    if not block.soft:
+        return [(block.lower, block.upper, 0.0)]
+    sides: list[tuple[Array | None, Array | None, float]] = []
+    if block.lower is not None:
+        sides.append((block.lower, None, 1.0))
+    if block.upper is not None:
+        sides.append((None, block.upper, -1.0))
+    return sides
+
+
+def _bound(values: Array | None, missing: float, block: LinearRows) -> Array:
+    return _flat(np.full(block.jac.shape[:4], missing) if values is None else values)

@@ -1,0 +1,72 @@
+"""KKT residuals of many programs of one sparsity in one compiled loop, on unscaled data."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from napf_mpc.jit import compiled
+from napf_mpc.quadratic_program import Array, Index, Sparsity, Values
+
+
+def kkt_residuals(sparsity: Sparsity, values: Values, z: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Residuals as :class:`~napf_mpc.quadratic_program.Residuals` defines them, of all programs.
+
+    Parameters
+    ----------
+    sparsity : Sparsity
+        Of all programs.
+    values : Values
+        Numbers (run, uav, ...).
+    z, y : array, shapes (run, uav, n) and (run, uav, m)
+        Points and multipliers; a program with a number that is not finite gets infinite residuals.
+
+    Returns
+    -------
+    primal, dual, complementarity : array, shape (run, uav)
+        Largest row violation, largest entry of ``P z + q + A' y``, largest multiplier times gap.
+    """
+    batch, n, m = z.shape[:-1], sparsity.variables, sparsity.constraints
+    count = math.prod(batch)
+    out = np.empty((count, 3))
+    _residuals(
+        sparsity.p_starts, sparsity.p_rows, sparsity.a_starts, sparsity.a_rows,
+        values.p.reshape(count, len(sparsity.p_rows)), values.q.reshape(count, n),
+        values.a.reshape(count, len(sparsity.a_rows)), values.lower.reshape(count, m),
+        values.upper.reshape(count, m), z.reshape(count, n), y.reshape(count, m), out,
+    )  # fmt: skip
+    primal, dual, complementarity = out.T.reshape(3, *batch)
+    return primal, dual, complementarity
+
+
+@compiled
+def _residuals(
+    p_starts: Index, p_rows: Index, a_starts: Index, a_rows: Index,
+    p: Array, q: Array, a: Array, lower: Array, upper: Array, z: Array, y: Array, out: Array,
+) -> None:  # fmt: skip
+    n, m = z.shape[1], y.shape[1]
+    rows = np.empty(m)
+    for i in range(z.shape[0]):
+        primal, dual, product, finite = 0.0, 0.0, 0.0, True
+        rows[:] = 0.0
+        for j in range(n):
+            finite = finite and np.isfinite(z[i, j])
+            gradient = q[i, j]
+            # P is symmetric: its column is its row.
+            for k in range(p_starts[j], p_starts[j + 1]):
+                gradient += p[i, k] * z[i, p_rows[k]]
+            for k in range(a_starts[j], a_starts[j + 1]):
+                gradient += a[i, k] * y[i, a_rows[k]]
+                rows[a_rows[k]] += a[i, k] * z[i, j]
+            dual = max(dual, abs(gradient))
+        for r in range(m):
+            multiplier = y[i, r]
+            finite = finite and np.isfinite(multiplier)
+            over, under = rows[r] - upper[i, r], lower[i, r] - rows[r]
+            primal = max(primal, over, under)
+            gap = over if multiplier > 0.0 else under
+            # A multiplier on a bound that does not exist is an error as large as the multiplier itself.
+            product = max(product, abs(multiplier) * (abs(gap) if np.isfinite(gap) else 1.0))
+        # NaN would lose every comparison above and pass for zero.
+        out[i] = np.array([primal, dual, product]) if finite else np.full(3, np.inf)
