@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from rich.text import Text
 from napf_mpc.evaluate import Outcome
 from napf_mpc.problem import Reference
 from napf_mpc.risk import wilson
+from napf_mpc.words import shown_text
 
 METRIC_LABELS = {
     "path_rms_m": "path RMS [m]",
@@ -30,8 +32,6 @@ METRIC_LABELS = {
     "nees_position": "  of the position alone",
     "gated_fixes": "fixes refused by the filter",
 }
-
-
 _OF_FILTER = {"nees", "nees_position", "gated_fixes"}
 
 
@@ -50,10 +50,9 @@ class Rows:
 
     def markdown(self) -> str:
         """Return the table as Markdown."""
-        lines = [f"## {self.title}", "", "| " + " | ".join(self.header) + " |"]
-        lines.append("|" + "|".join([" --- ", *[" ---: "] * (len(self.header) - 1)]) + "|")
-        lines += ["| " + " | ".join(row) + " |" for row in self.rows]
-        return "\n".join([*lines, "", *self.notes, ""])
+        rule = "|" + "|".join([" --- ", *[" ---: "] * (len(self.header) - 1)]) + "|"
+        lines = [f"## {self.title}", "", _markdown_row(self.header), rule, *map(_markdown_row, self.rows)]
+        return "\n".join([*lines, "", *(f"- {note}" for note in self.notes), ""])
 
     def print(self, console: Console) -> None:
         """Print the table on a terminal."""
@@ -68,6 +67,10 @@ class Rows:
             console.print(note, markup=False, highlight=False)
 
 
+def _markdown_row(cells: tuple[str, ...]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
 def comparison(summary: dict[str, Any], reference: Reference | None = None) -> Rows:
     """Table 1 for any problem: planners side by side, every rate with k, n and interval."""
     planners: dict[str, dict[str, Any]] = summary["planners"]
@@ -80,7 +83,7 @@ def comparison(summary: dict[str, Any], reference: Reference | None = None) -> R
         for name in planners:
             value = published.get(name)
             cells.append("" if value is None else f"{100 * value:.2f} % (n = {reference.runs})")
-        rows.append((f"  {reference.source}", *cells))
+        rows.append((f"  {shown_text(reference.source, 100)}", *cells))
     rows.append(("  of one UAV", *[_rate(p, "uav_collision_risk", p["uavs"]) for p in each]))
     rows.append(("UAV-UAV contact", *[_rate(p, "uav_contact_risk") for p in each]))
     for outcome in Outcome:
@@ -100,7 +103,7 @@ def comparison(summary: dict[str, Any], reference: Reference | None = None) -> R
     notes += [_pair(pair) for pair in summary["paired"]]
     if reference is not None:
         notes += [_reference_note(reference)]
-    return Rows(str(summary["problem"]), ("", *planners), tuple(rows), tuple(notes))
+    return Rows(shown_text(summary["problem"], 200), ("", *planners), tuple(rows), tuple(notes))
 
 
 def _rate(planner: dict[str, Any], key: str, uavs: int = 1) -> str:
@@ -140,7 +143,7 @@ def _reference_note(reference: Reference) -> str:
         rate = wilson(round(value * reference.runs), reference.runs)
         intervals.append(f"{name} {100 * rate.low:.1f}-{100 * rate.high:.1f} %")
     words = f"{reference.source}: its {reference.runs} runs alone allow {', '.join(intervals)} (95 % Wilson)."
-    return f"{words} {reference.note}".strip()
+    return shown_text(f"{words} {reference.note}".strip(), 2000)
 
 
 def mission_table(row: dict[str, Any], name: str) -> Rows:
@@ -151,10 +154,11 @@ def mission_table(row: dict[str, Any], name: str) -> Rows:
     cells.append(("joint success", "yes" if row["joint_success"] else "no"))
     for key, label in METRIC_LABELS.items():
         value = float(row[key])
-        if key not in _OF_FILTER or value == value:
-            cells.append((label, f"{value:.2f}" if value == value else "not defined"))
+        defined = math.isfinite(value)
+        if defined or key not in _OF_FILTER:
+            cells.append((label, f"{value:.2f}" if defined else "not defined"))
     return Rows(
-        f"{name}, planner {row['planner']}, run {row['run']} of seed {row['seed']}",
+        f"{shown_text(name, 200)}, planner {row['planner']}, run {row['run']} of seed {row['seed']}",
         ("", "value"),
         tuple(cells),
         (),

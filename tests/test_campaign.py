@@ -161,16 +161,18 @@ def test_what_is_finished_is_kept_when_flying_stops(
     assert fly(tmp_path, 100, block_runs=20) == digest(hundred)
 
 
+@pytest.mark.parametrize("full_at", [5, 6, 11])
 def test_a_full_disk_keeps_what_is_finished(
-    hundred: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    full_at: int, hundred: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Whichever file is the first that does not fit: the third block's two, or the table of all runs."""
     written = 0
     write_table = store.write_table
 
     def until_full(path: Path, *rest: Any) -> None:
         nonlocal written
         written += 1
-        if written == 6:
+        if written == full_at:
             raise OutputError(f"{path}: cannot be written: No space left on device")
         write_table(path, *rest)
 
@@ -277,6 +279,17 @@ def test_a_damaged_block_is_named_with_the_way_out(kind: str, damage: str, tmp_p
     assert digest(tmp_path) == before
     (tmp_path / "blocks" / "rows_00000004_00000008.parquet").unlink()
     assert fly(tmp_path, 12, block_runs=4) == before
+
+
+def test_a_truncated_block_is_found_before_anything_is_flown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fly(tmp_path, 12, block_runs=4)
+    DAMAGE["truncated"](tmp_path / "blocks" / "rows_00000004_00000008.parquet")
+    flown = flown_by(monkeypatch)
+    with pytest.raises(DataError, match="rows_00000004_00000008"):
+        fly(tmp_path, 24, block_runs=4)
+    assert flown == []
 
 
 def test_a_block_of_another_campaign_is_noticed(tmp_path: Path) -> None:

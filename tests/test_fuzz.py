@@ -7,7 +7,6 @@ import copy
 import itertools
 import json
 import math
-import os
 import random
 import resource
 import subprocess
@@ -26,7 +25,8 @@ from pydantic import BaseModel
 
 from napf_mpc.block import simulate
 from napf_mpc.campaign import check_flyable
-from napf_mpc.errors import DataError, NapfError
+from napf_mpc.cli import run_command
+from napf_mpc.errors import DataError, NapfError, ProblemError
 from napf_mpc.goal_walk import walk_to_goal
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem_file import load_problem
@@ -140,13 +140,13 @@ def sample() -> list[tuple[str, Tables]]:
 # ------------------------------------------------------------------------------------------------- flying
 
 
-def flies(problem: Problem) -> None:
-    """Fly as `run` does, but for two seconds only; a point walks all its way."""
+def flies(problem: Problem, seconds: float = FLOWN_S) -> None:
+    """Fly as `run` does, but for a short time only; a point walks all its way."""
     if not isinstance(problem.mission, FormationMission):
         walk_to_goal(problem, scenes_of(problem))
         return
     simulation = problem.simulation.model_copy(
-        update={"time_limit_s": min(FLOWN_S, problem.simulation.time_limit_s)}
+        update={"time_limit_s": min(seconds, problem.simulation.time_limit_s)}
     )
     score = simulate(
         problem.model_copy(update={"simulation": simulation}), problem.planner.kind, record_every=1
@@ -215,24 +215,28 @@ def test_mutated_problem_files_are_refused_clearly_or_fly(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_mutated_problem_files_through_the_command(tmp_path: Path) -> None:
+def test_mutated_problem_files_through_the_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NAPF_MPC_DATA", "")
+    path = tmp_path / "mutant.toml"
+    codes = []
     for name, tables in sample()[:THROUGH_THE_COMMAND]:
-        path = tmp_path / "mutant.toml"
         path.write_text(toml(tables), encoding="utf-8")
-        done = subprocess.run(
-            [sys.executable, "-m", "napf_mpc", "validate", str(path)],
-            capture_output=True,
-            text=True,
-            timeout=120,
-            env=os.environ | {"NAPF_MPC_DATA": ""},
-        )
-        assert done.returncode in (0, 2), name
-        assert "Traceback" not in done.stderr, name
-        if done.returncode == 0:
-            assert done.stdout.startswith(f"{path}: valid"), name
+        codes.append(run_command(["validate", str(path)]))
+        printed = capsys.readouterr()
+        if codes[-1] == 0:
+            assert printed.out.startswith(f"{path}: valid"), name
+            assert printed.err == "", name
         else:
-            assert done.stdout == ""
-            assert all(line.startswith("error: ") for line in done.stderr.splitlines()), name
+            assert codes[-1] == 2, name
+            assert printed.out == "", name
+            assert all(line.startswith("error: ") for line in printed.err.splitlines()), name
+    assert set(codes) == {0, 2}
+    last = subprocess.run(
+        [sys.executable, "-m", "napf_mpc", "validate", str(path)], capture_output=True, text=True, timeout=120
+    )
+    assert (last.returncode, last.stdout, last.stderr) == (codes[-1], printed.out, printed.err)
 
 
 # ------------------------------------------------------------------------------------------------- limits
@@ -257,7 +261,9 @@ def families() -> dict[str, Tables]:
     found["filter"] = table1 | {"navigation": {"filter": "kalman", "outage_interval_s": 5.0}}
     found["solids"] = table1 | {"world": {"kind": "list", "obstacles": SOLIDS}}
     found["walk in a random world"] = walk | {"world": {"kind": "scatter"}}
-    return found
+    # Errors are drawn for the whole time limit: a short one is quicker to draw.
+    short = {"simulation": {"time_limit_s": FLOWN_S}}
+    return {name: tables | short for name, tables in found.items()}
 
 
 SOLIDS = [
@@ -346,7 +352,7 @@ def test_every_number_at_its_limits_flies_or_is_refused(tmp_path: Path) -> None:
             except NapfError:
                 refused.append(name)
                 continue
-            flies(problem)
+            flies(problem, 1.0)
             flown += 1
         assert meter.seconds < MOST_S, name
         assert meter.gb < MOST_GB, name
@@ -354,11 +360,17 @@ def test_every_number_at_its_limits_flies_or_is_refused(tmp_path: Path) -> None:
     assert len(refused) < flown
 
 
+def test_more_errors_than_memory_holds_are_refused_with_the_way_out() -> None:
+    crowd = {"formation": {"shape": "line", "count": 4096}, "mission": {"length_m": 10.0}}
+    with pytest.raises(ProblemError, match=r"make 1\.47e\+08 position fixes .* lower one of the three"):
+        load_problem("table1_8", crowd | {"simulation.time_limit_s": 3600.0})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
-        {"formation": {"shape": "line", "count": 4096}, "simulation.time_limit_s": 3600.0},
+        {"formation": {"shape": "line", "count": 4096}, "simulation.time_limit_s": 450.0},
         {"simulation.time_limit_s": 3600.0, "navigation.rate_hz": 50.0},
         {"formation": {"shape": "line", "count": 4096}, "world.count": 1000},
         {"simulation.step_s": 0.001, "simulation.controller_rate_hz": 1000.0, "planner.rate_hz": 100.0},

@@ -121,7 +121,6 @@ def complete(out: Path) -> str:
         (signal.SIGINT, 1, True),  # Ctrl-C at a terminal
         (signal.SIGINT, 2, True),
         (signal.SIGTERM, 1, False),  # kill
-        (signal.SIGTERM, 2, False),
         (signal.SIGTERM, 2, True),  # an init system that ends a service
     ],
 )
@@ -165,11 +164,13 @@ def test_five_stops_at_random_moments_lose_nothing(
         (out / ".lock").unlink(missing_ok=True)
         with started(out, "--workers", "2") as process:
             wait_until_flying(out, process)
-            time.sleep(moments.uniform(0.0, 2.5))
+            time.sleep(moments.uniform(0.0, 2.0))
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGINT if kind == "ctrl-c" else signal.SIGKILL)
-            process.communicate(timeout=30)
+            _, stderr = process.communicate(timeout=30)
             assert process.returncode in ((0, 130) if kind == "ctrl-c" else (0, -9))
+            if process.returncode != -9:
+                assert re.fullmatch(r"(stopped: \d+ of 96 runs are kept .*\n)?", stderr), stderr
         assert len(finished(out)) >= kept
         kept = len(finished(out))
     assert complete(out) == undisturbed
@@ -185,23 +186,6 @@ def test_workers_end_with_a_process_that_was_killed(tmp_path: Path) -> None:
         while alive(process.pid) and time.monotonic() < deadline:
             time.sleep(0.1)
         assert alive(process.pid) == []
-
-
-def test_a_killed_worker_costs_its_block_only(undisturbed: str, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    with started(out, "--workers", "2") as process:
-        wait_until_flying(out, process, blocks=1)
-        ps = subprocess.run(
-            ["ps", "-A", "-o", "pid=,ppid=,args="], capture_output=True, text=True, check=True
-        )
-        children = [line.split(None, 2) for line in ps.stdout.splitlines()]
-        workers = [
-            int(pid) for pid, parent, words in children if parent == str(process.pid) and "loky" in words
-        ]
-        os.kill(workers[-1], signal.SIGKILL)
-        _, stderr = process.communicate(timeout=120)
-    assert (process.returncode, stderr) == (0, "")
-    assert digest(out) == undisturbed
 
 
 def test_a_stop_without_an_output_folder_says_that_nothing_is_kept(tmp_path: Path) -> None:
