@@ -132,9 +132,14 @@ def _pair(pair: dict[str, Any]) -> str:
     a, b = pair["a"], pair["b"]
     return (
         f"{a} against {b}, same runs: both hit in {pair['both']}, only {a} in {pair['only_a']}, only {b} in "
-        f"{pair['only_b']}, neither in {pair['neither']}; exact McNemar p = {pair['p_value']:.2g}, "
-        f"corrected for the number of pairs {pair['p_value_corrected']:.2g}."
+        f"{pair['only_b']}, neither in {pair['neither']}; exact McNemar p {_p(pair['p_value'])}, "
+        f"corrected for the number of pairs {_p(pair['p_value_corrected'])}."
     )
+
+
+def _p(value: float) -> str:
+    # Smaller ones are zero in floating point, which no p-value is.
+    return f"= {value:.2g}" if value >= 1e-300 else "< 1e-300"
 
 
 def _reference_note(reference: Reference) -> str:

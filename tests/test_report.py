@@ -87,6 +87,12 @@ def test_the_paired_test_is_told_in_words(summary: dict[str, Any]) -> None:
     assert f"p = {pair['p_value']:.2g}" in note
 
 
+def test_a_p_value_too_small_for_floating_point_is_not_said_to_be_zero(summary: dict[str, Any]) -> None:
+    pair = {**summary["paired"][0], "p_value": 0.0, "p_value_corrected": 2e-250}
+    note = next(note for note in comparison({**summary, "paired": [pair]}).notes if "McNemar" in note)
+    assert "p < 1e-300, corrected for the number of pairs = 2e-250." in note
+
+
 @pytest.mark.parametrize("width", [60, 80, 140])
 def test_nothing_is_cut_off_in_a_narrow_terminal(width: int, summary: dict[str, Any]) -> None:
     text = printed(comparison(summary, PAPER), width)
