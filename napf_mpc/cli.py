@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from napf_mpc import interrupts
-from napf_mpc.errors import NapfError, ProblemError
+from napf_mpc.errors import DataError, NapfError
 
 if TYPE_CHECKING:
     from napf_mpc.problem import Problem
@@ -142,10 +142,18 @@ def validate(
 ) -> None:
     """Check a problem file: every error with key, value and what is allowed."""
     problem = _problem(file, settings)
-    from napf_mpc.mission import check_mission
+    from napf_mpc.campaign import check_flyable
+    from napf_mpc.problem import FormationMission
+    from napf_mpc.scenario_file import scenes_of
 
-    missing = check_mission(problem, data)
-    note = f"its data are not here, so it was checked without them: {missing}" if missing else ""
+    note = ""
+    try:
+        if isinstance(problem.mission, FormationMission):
+            check_flyable(problem, [problem.planner.kind], data_folder=data)
+        else:
+            scenes_of(problem, data_folder=data)
+    except DataError as error:
+        note = f"its data could not be used: {error}"
     if as_json:
         _print_json({"file": file, "valid": True, "problem_hash": problem.digest(), "note": note})
         return
@@ -239,8 +247,6 @@ def figures(
 ) -> None:
     """Draw the paper's figures for a problem, or the figures of stored results."""
     if Path(source).is_dir():
-        if settings:
-            raise ProblemError(source, ["is drawn as it was flown: --set is for problems"])
         from napf_mpc.figures import draw_stored
 
         paths = draw_stored(Path(source), out, data, animation)

@@ -191,33 +191,6 @@ def test_workers_end_with_a_process_that_was_killed(tmp_path: Path) -> None:
         assert alive(process.pid) == []
 
 
-STUCK = """
-import sys, time
-from napf_mpc import interrupts
-interrupts.handle_signals()
-print("ready", flush=True)
-while True:
-    try:
-        time.sleep(60)
-    except BaseException:
-        pass
-"""
-
-
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
-def test_a_stop_comes_for_certain_whatever_hangs(signum: signal.Signals) -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-c", STUCK], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    before = time.monotonic()
-    process.send_signal(signum)
-    _, stderr = process.communicate(timeout=30)
-    assert time.monotonic() - before < 3.0
-    assert (process.returncode, stderr) == (128 + signum, "stopped\n")
-
-
 def test_a_stop_without_an_output_folder_says_that_nothing_is_kept(tmp_path: Path) -> None:
     words = command(tmp_path / "out", "--workers", "1")
     words[words.index("montecarlo")] = "compare"
