@@ -1,6 +1,20 @@
-"""``python -m napf_mpc``: the same as the command ``napf-mpc``."""
+"""The command ``napf-mpc``, also as ``python -m napf_mpc``."""
 
-from napf_mpc.cli import main
+from typing import NoReturn
+
+from napf_mpc import interrupts
+
+
+def main() -> NoReturn:
+    """Run the command line and leave with its exit code: 0, 1 (not reached), 2 (bad input), 130 or 143."""
+    interrupts.run(_command)
+
+
+def _command() -> int:
+    from napf_mpc.cli import run_command  # a stop while this loads is a clean one too
+
+    return run_command()
+
 
 if __name__ == "__main__":
     main()

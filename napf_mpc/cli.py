@@ -7,12 +7,12 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from napf_mpc import interrupts
-from napf_mpc.errors import DataError, NapfError
+from napf_mpc.errors import NapfError, ProblemError
 
 if TYPE_CHECKING:
     from napf_mpc.problem import Problem
@@ -48,16 +48,6 @@ Animation = Annotated[bool, typer.Option("--animation", help="Draw an animation 
 
 
 _UsageError: Any = typer.BadParameter.__base__  # click's, wherever this version of typer keeps it
-
-
-def main() -> NoReturn:
-    """Run the command line and leave with its exit code: 0, 1 (not reached), 2 (bad input), 130 or 143."""
-    interrupts.handle_signals()
-    try:
-        sys.exit(run_command())
-    except interrupts.Stopped as stop:
-        interrupts.say_stopped()
-        sys.exit(stop.exit_code)
 
 
 def run_command(arguments: Sequence[str] | None = None) -> int:
@@ -142,18 +132,10 @@ def validate(
 ) -> None:
     """Check a problem file: every error with key, value and what is allowed."""
     problem = _problem(file, settings)
-    from napf_mpc.campaign import check_flyable
-    from napf_mpc.problem import FormationMission
-    from napf_mpc.scenario_file import scenes_of
+    from napf_mpc.mission import check_mission
 
-    note = ""
-    try:
-        if isinstance(problem.mission, FormationMission):
-            check_flyable(problem, [problem.planner.kind], data_folder=data)
-        else:
-            scenes_of(problem, data_folder=data)
-    except DataError as error:
-        note = f"its data could not be used: {error}"
+    missing = check_mission(problem, data)
+    note = f"its data are not here, so it was checked without them: {missing}" if missing else ""
     if as_json:
         _print_json({"file": file, "valid": True, "problem_hash": problem.digest(), "note": note})
         return
@@ -247,6 +229,8 @@ def figures(
 ) -> None:
     """Draw the paper's figures for a problem, or the figures of stored results."""
     if Path(source).is_dir():
+        if settings:
+            raise ProblemError(source, ["is drawn as it was flown: --set is for problems"])
         from napf_mpc.figures import draw_stored
 
         paths = draw_stored(Path(source), out, data, animation)
@@ -285,6 +269,7 @@ def _campaign(
         tell = stack.enter_context(_progress(runs, quiet or as_json))
 
         def progress(done: int) -> None:
+            interrupts.raise_if_asked()
             tell(done)
             kept_runs = f"{done} of {runs} runs are kept in {out}; repeat the command to go on"
             interrupts.when_stopped(

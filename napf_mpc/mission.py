@@ -8,12 +8,14 @@ from typing import Any
 
 from napf_mpc import store
 from napf_mpc.block import MAX_RUNS, Block, check_campaign, fly_block
+from napf_mpc.campaign import check_flyable
 from napf_mpc.campaign_folder import taken
-from napf_mpc.errors import ProblemError
+from napf_mpc.errors import DataError, ProblemError
 from napf_mpc.evaluate import Outcome
 from napf_mpc.goal_walk import walk_block
+from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import FormationMission, Problem
-from napf_mpc.provenance import identity
+from napf_mpc.provenance import data_digests, identity
 from napf_mpc.scenario_file import scenes_of, write_scenario
 from napf_mpc.summary import summarise
 from napf_mpc.words import shown_value
@@ -37,6 +39,33 @@ class FlownMission:
     def reached(self) -> bool:
         """Whether the outcome is ``reached``."""
         return str(self.row["outcome"]) == str(Outcome.REACHED)
+
+
+def check_mission(problem: Problem, data_folder: Path | None = None) -> str:
+    """Build everything that flying a problem needs: what passes here also flies.
+
+    Returns
+    -------
+    str
+        Which data are missing, so that what depends on them could not be checked; empty if none.
+
+    Raises
+    ------
+    NapfError
+        If the problem cannot be flown: planner, scene, inner loop, or what is in its data files.
+    """
+    flies = isinstance(problem.mission, FormationMission)
+    try:
+        data_digests(problem, data_folder)
+    except DataError as missing:
+        if flies:
+            make_planner(problem.planner.kind, problem)
+        return str(missing)
+    if flies:
+        check_flyable(problem, [problem.planner.kind], data_folder=data_folder)
+    else:
+        scenes_of(problem, data_folder=data_folder)
+    return ""
 
 
 def fly_mission(

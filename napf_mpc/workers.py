@@ -75,17 +75,14 @@ def _in_pool(
     task: Callable[[range], T], blocks: list[range], workers: int
 ) -> Generator[tuple[range, T], None, None]:
     import joblib  # only here: it costs start-up time that a single process need not pay
-    from joblib.externals.loky.backend import resource_tracker
 
     parallel = joblib.Parallel(
-        n_jobs=max(2, min(workers, len(blocks))),  # 1 would do the task in this process
+        n_jobs=max(2, min(workers, len(blocks))),  # with 1, joblib would fly a last block in this process
         backend="loky",
         return_as="generator_unordered",
         batch_size=1,
         max_nbytes=None,
     )
-    # Its start unblocks Ctrl-C for the whole process, so it must not fall into the next lines.
-    resource_tracker.ensure_running()
     with _without_interrupts():
         results = parallel(joblib.delayed(_numbered)(task, block, os.getpid()) for block in blocks)
     try:
@@ -103,7 +100,7 @@ def _without_interrupts() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    # These helpers of theirs unblock signals when they start, so they have to run by now.
+    # These helper processes of theirs unblock signals when they start, so they have to run by now.
     from multiprocessing import resource_tracker
 
     from joblib.externals.loky.backend import resource_tracker as loky_resource_tracker

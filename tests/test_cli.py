@@ -166,6 +166,7 @@ def test_the_module_is_the_command() -> None:
         ("validate nonsense", "no such file"),
         ("validate table1_8 --set world.count=-1", "world.count = -1"),
         ("figures nonsense --out O", "no such file"),
+        ("figures . --out O --set planner.k=2", "is drawn as it was flown"),
         ("montecarlo P", "Missing option '--out'"),
         ("montecarlo P --out O --cluster here", "No such option: --cluster"),
         ("run", "Missing argument"),
@@ -245,6 +246,18 @@ def test_valid_without_its_data_says_so(
     assert (code, err) == (0, "")
     assert "nishi_shinjuku: valid" in out
     assert "buildings.geojson" in out
+
+
+def test_data_that_are_there_but_of_no_use_are_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "log.csv").write_text("nothing of use")
+    settings = ["--set", 'navigation.kind="recorded"', "--set", 'navigation.file="log.csv"']
+    path = tmp_path / "brief.toml"
+    path.write_text(PROBLEM)
+    code, out, err = done(capsys, "validate", path, "--data", tmp_path, *settings)
+    assert (code, out) == (2, "")
+    assert "log.csv" in err
 
 
 @pytest.mark.parametrize(

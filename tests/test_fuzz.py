@@ -24,10 +24,10 @@ import pytest
 from pydantic import BaseModel
 
 from napf_mpc.block import simulate
-from napf_mpc.campaign import check_flyable
 from napf_mpc.cli import run_command
-from napf_mpc.errors import DataError, NapfError, ProblemError
+from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.goal_walk import walk_to_goal
+from napf_mpc.mission import check_mission
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.scenario_file import scenes_of
@@ -155,18 +155,6 @@ def flies(problem: Problem, seconds: float = FLOWN_S) -> None:
     assert score.outcome[0] != "failed"
 
 
-def validates(problem: Problem) -> bool:
-    """What `validate` does once the file is read. False where data are missing, of which it only tells."""
-    try:
-        if isinstance(problem.mission, FormationMission):
-            check_flyable(problem, [problem.planner.kind])
-        else:
-            scenes_of(problem)
-    except DataError:
-        return False
-    return True
-
-
 class Meter:
     """Time and memory that a case takes."""
 
@@ -199,7 +187,7 @@ def test_mutated_problem_files_are_refused_clearly_or_fly(tmp_path: Path) -> Non
             told, problem, flyable = "", None, False
             try:
                 problem = load_problem(path)
-                flyable = validates(problem)
+                flyable = not check_mission(problem)
             except NapfError as error:
                 told = str(error)
             if told:
@@ -348,7 +336,7 @@ def test_every_number_at_its_limits_flies_or_is_refused(tmp_path: Path) -> None:
         with Meter() as meter:
             try:
                 problem = load_problem(path)
-                validates(problem)
+                check_mission(problem)
             except NapfError:
                 refused.append(name)
                 continue
@@ -380,7 +368,7 @@ def test_large_numbers_together_fly_or_are_refused(settings: dict[str, Any]) -> 
     with Meter() as meter:
         try:
             problem = load_problem("table1_8", {"mission": {"length_m": 10.0}} | settings)
-            validates(problem)
+            check_mission(problem)
         except NapfError:
             return
         flies(problem)
