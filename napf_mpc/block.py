@@ -14,8 +14,9 @@ from napf_mpc import store
 from napf_mpc.closed_loop import Scenario, build_scenario, closed_loop
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import MissionScore, Score
-from napf_mpc.planners.planner import Planner
+from napf_mpc.planners.planner import Planner, tally_of
 from napf_mpc.planners.registry import make_planner
+from napf_mpc.planners.tally import Tally
 from napf_mpc.problem import Problem
 from napf_mpc.record import TrajectoryRecorder
 from napf_mpc.words import shown_value
@@ -47,6 +48,8 @@ class Missions:
     """What they flew through."""
     trajectories: store.Columns
     """Rows by run, time and UAV; no columns if not asked for."""
+    tally: Tally
+    """What the planner's solver did."""
 
 
 def simulate(
@@ -96,7 +99,7 @@ def simulate(
     pilot = make_planner(planner, problem) if isinstance(planner, str) else planner
     check_campaign([pilot.name], indices.stop, seed)
     scenario = build_scenario(problem, seed, indices, data_folder)
-    return Missions(*_fly(problem, pilot, scenario, record_every))
+    return _fly(problem, pilot, scenario, record_every)
 
 
 def _checked_count(runs: int) -> int:
@@ -145,27 +148,24 @@ def fly_block(
         rows, timing, trajectories = [], [], []
         for name in planners:
             began = time.perf_counter()
-            score, _, track = _fly(problem, make_planner(name, problem), scenario, record_every)
+            flown = _fly(problem, make_planner(name, problem), scenario, record_every)
             timing.append(timing_row(name, runs, time.perf_counter() - began))
-            rows.append(score_rows(name, seed, score))
-            if track:
-                trajectories.append(track)
+            rows.append(score_rows(name, seed, flown.score, flown.tally))
+            if flown.trajectories:
+                trajectories.append(flown.trajectories)
     return Block(store.stack(rows), store.stack(timing), store.stack(trajectories))
 
 
-def _fly(
-    problem: Problem, planner: Planner, scenario: Scenario, record_every: int
-) -> tuple[Score, Scenario, store.Columns]:
+def _fly(problem: Problem, planner: Planner, scenario: Scenario, record_every: int) -> Missions:
     judge = MissionScore(problem, scenario)
-    if not record_every:
-        return judge.score(closed_loop(problem, planner, scenario, (judge,))), scenario, {}
-    recorder = TrajectoryRecorder(planner.name, scenario.runs, record_every)
-    flight = closed_loop(problem, planner, scenario, (judge, recorder))
-    return judge.score(flight), scenario, recorder.columns()
+    recorder = TrajectoryRecorder(planner.name, scenario.runs, record_every) if record_every else None
+    flight = closed_loop(problem, planner, scenario, (judge,) if recorder is None else (judge, recorder))
+    track = {} if recorder is None else recorder.columns()
+    return Missions(judge.score(flight), scenario, track, tally_of(planner, len(scenario.runs)))
 
 
-def score_rows(planner: str, seed: int, score: Score) -> store.Columns:
-    """Return one row a run: who, which run, how it ended, and its metrics."""
+def score_rows(planner: str, seed: int, score: Score, tally: Tally | None = None) -> store.Columns:
+    """Return one row a run: who, which run, how it ended, its metrics, and what the solver did."""
     runs = len(score.runs)
     return {
         "planner": np.full(runs, planner),
@@ -178,7 +178,9 @@ def score_rows(planner: str, seed: int, score: Score) -> store.Columns:
         "uavs_hit": score.obstacle_contact.sum(-1).astype(np.int64),
         "uavs": np.full(runs, score.obstacle_contact.shape[1], dtype=np.int64),
         "joint_success": score.joint_success,
+        "reason": np.array(score.reason, dtype=np.str_),
         **score.metrics,
+        **(tally or Tally.none(runs)).columns(),
     }
 
 

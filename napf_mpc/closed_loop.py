@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -139,6 +139,9 @@ class Flight:
     """(run,) time flown [s]."""
     gated_fixes: NDArray[np.int64] | None = None
     """(run,) position fixes that the navigation filter refused; None without a filter."""
+    reason: NDArray[np.int8] | None = None
+    """(run,) why it waited at the end, codes of :class:`~napf_mpc.planners.planner.Reason`, the largest of
+    the run's UAVs; None if it never did."""
 
 
 def closed_loop(
@@ -173,6 +176,7 @@ def closed_loop(
     active = np.ones(runs, dtype=bool)
     failed = np.zeros(runs, dtype=bool)
     holding = np.zeros(runs, dtype=bool)
+    reason = np.zeros(runs, dtype=np.int8)
     finish_time = np.full(runs, np.nan)
     duration = np.zeros(runs)
     planner.reset(scenario.obstacles, runs)
@@ -198,8 +202,11 @@ def closed_loop(
                 covariance = _with_velocity(fix.covariance)
             nav = _solution(time_s, state, fix, covariance)
         if command is None or tick % clock.ticks_per_plan == 0:
-            command = planner.step(nav, time_s)
+            airborne = np.repeat(active[:, None], state.shape[1], axis=1)
+            command = planner.step(replace(nav, airborne=airborne), time_s)
             holding[active] = command.holding[active].any(-1)
+            if command.reason is not None:
+                reason[active] = command.reason[active].max(-1)
         inputs = _inner_loop(law, nav, command, active)
         for observer in observers:
             observer.ticked(time_s, state, nav, command, inputs, active)
@@ -234,6 +241,7 @@ def closed_loop(
         finish_time,
         duration,
         None if filtered is None else filtered.gated_fixes,
+        reason,
     )
 
 
@@ -298,15 +306,21 @@ def _solution(time_s: float, state: Array, fix: Fix, covariance: Array) -> NavSo
 
 
 def _inner_loop(law: TrackingLaw, nav: NavSolution, command: Command, active: Mask) -> Array:
+    position, velocity, direction = command.position, command.velocity, command.direction
+    attitude, rates, feedforward = nav.attitude, nav.body_rates, command.feedforward
+    if command.plan is not None and command.planned is not None:
+        # u = u_plan(t) - K (x_nav - x_plan(t)): the law counts attitude and rates from level flight at the
+        # reference yaw, so it is shown their difference to the plan's.
+        planned = command.planned[..., None]
+        state, held = command.plan.at(nav.time_s)
+        position = np.where(planned, state[..., POSITION], position)
+        velocity = np.where(planned, state[..., VELOCITY], velocity)
+        direction = np.where(planned, 0.0, direction)
+        lean = state[..., ATTITUDE] - command.yaw[..., None] * np.array([0.0, 0.0, 1.0])
+        attitude = attitude - np.where(planned, lean, 0.0)
+        rates = rates - np.where(planned, state[..., RATES], 0.0)
+        feedforward = np.where(planned, held, feedforward)
     return law.inputs(
-        nav.position,
-        nav.velocity,
-        nav.attitude,
-        nav.body_rates,
-        command.position,
-        command.velocity,
-        command.direction,
-        command.yaw,
-        command.feedforward,
+        nav.position, nav.velocity, attitude, rates, position, velocity, direction, command.yaw, feedforward,
         active,
-    )
+    )  # fmt: skip

@@ -14,7 +14,7 @@ from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.jit import compiled
 from napf_mpc.navigation.consistency import normalised_errors
 from napf_mpc.navigation.solution import NavSolution
-from napf_mpc.planners.planner import Command
+from napf_mpc.planners.planner import REASON_WORDS, Command, Reason
 from napf_mpc.problem import Problem
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.vehicle.quadrotor import hover_input
@@ -80,6 +80,8 @@ class Score:
     """(run,) reached, no contact of either kind, and re-formed."""
     finished: NDArray[np.bool_]
     """(run,) every UAV passed the mission's length in time, contacts or not."""
+    reason: tuple[str, ...]
+    """(run,) why a run that did not finish waited; empty if it did finish, or did not wait."""
     metrics: dict[str, Array]
     """Name -> (run,); NaN where the metric is not defined, such as a finish time without a finish."""
 
@@ -192,6 +194,7 @@ class MissionScore:
         separation = self._separation.min(-1)
         uav = separation < vehicle.min_separation_m
         collided = obstacle.any(-1) | uav
+        waited = np.zeros(len(collided), dtype=np.int8) if flight.reason is None else flight.reason
         outcome = tuple(
             Outcome.FAILED
             if failed
@@ -199,11 +202,13 @@ class MissionScore:
             if hit
             else Outcome.REACHED
             if reached
+            else Outcome.ABORTED
+            if reason == Reason.NO_PASSAGE
             else Outcome.HELD
             if held
             else Outcome.TIMEOUT
-            for failed, hit, reached, held in zip(
-                flight.failed, collided, flight.reached, flight.holding, strict=True
+            for failed, hit, reached, held, reason in zip(
+                flight.failed, collided, flight.reached, flight.holding, waited, strict=True
             )
         )
         counted = self._sums[:, _COUNT]
@@ -238,6 +243,10 @@ class MissionScore:
             uav,
             flight.reached & ~collided & ~flight.failed & reformed,
             flight.reached & ~flight.failed,
+            tuple(
+                "" if done else REASON_WORDS[Reason(r)]
+                for done, r in zip(flight.reached, waited, strict=True)
+            ),
             metrics,
         )
 

@@ -119,6 +119,7 @@ def _score(problem: Problem, run: int, arrived: bool, points: Array, obstacles: 
         uav_contact=np.array([False]),
         joint_success=np.array([outcome is Outcome.REACHED]),
         finished=np.array([arrived]),
+        reason=("",),
         metrics=metrics,
     )
 

@@ -602,6 +602,32 @@ class Planner(_Section):
     """Least synchronised reference speed over V_r."""
     max_speed_ratio: float = Field(1.5, ge=1.0, le=10.0)
     """Largest commanded speed over V_r."""
+    solver: str = Field("osqp", min_length=1, max_length=50)
+    """QP planner: name of the solver."""
+    horizon: int = Field(20, ge=2, le=100)
+    """QP planner: stages N of the horizon; the first have the planner's period, later ones grow."""
+    look_ahead_s: float = Field(6.5, ge=0.1, le=60.0)
+    """QP planner: length of the horizon."""
+    passes: int = Field(1, ge=1, le=10)
+    """QP planner: times that a step's programs are made linear at the last answer and solved."""
+    obstacle_rows: int = Field(4, ge=1, le=50)
+    """QP planner: nearest obstacles that each stage of each UAV keeps rows for, in each of two shells."""
+    position_weight: float = Field(1.0, ge=1e-6, le=1e6)
+    """QP planner: weight of the distance to the slot [1/(m^2 s)]."""
+    velocity_weight: float = Field(1.0, ge=0.0, le=1e6)
+    """QP planner: weight of the velocity error [s/m^2]."""
+    attitude_weight: float = Field(1.0, ge=0.0, le=1e6)
+    """QP planner: weight of roll, pitch and yaw error [1/(rad^2 s)]; a fifth of it on body rates."""
+    thrust_weight: float = Field(3.0, ge=1e-9, le=1e6)
+    """QP planner: weight of the thrust about hover [1/(N^2 s)]."""
+    torque_weight: float = Field(20.0, ge=1e-9, le=1e6)
+    """QP planner: weight of the torques [1/(N^2 m^2 s)]."""
+    contact_price: float = Field(300.0, ge=0.0, le=1e9)
+    """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]."""
+    contact_extra_m: float = Field(0.0, ge=0.0, le=1e3)
+    """QP planner: distance kept from obstacles on top of the margin."""
+    influence_scale: float = Field(0.02, ge=1e-9, le=1e6)
+    """QP planner: price per metre and second for each m/s of NAPF's repulsion."""
     k: Annotated[float, Field(ge=0.0, le=20.0)] | None = None
     """Inflation in reported sigmas; 3 unless ``confidence`` is given."""
     confidence: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None

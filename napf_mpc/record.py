@@ -73,6 +73,13 @@ class TrajectoryRecorder:
             rows[name] = inputs[active][..., a].ravel()
         rows["holding"] = command.holding[active].ravel()
         rows["available"] = nav.available[active].ravel()
+        nothing = np.full(state.shape[:2], np.nan)
+        slack = nothing if command.slack_m is None else command.slack_m
+        rows["slack_m"] = slack[active].ravel()
+        words = np.full(state.shape[:2], None, dtype=object)
+        if command.solver_status is not None:
+            words[:] = command.solver_status
+        rows["solver_status"] = words[active].ravel()
         self._parts.append(rows)
 
     def columns(self) -> dict[str, NDArray[Any]]:
@@ -82,11 +89,4 @@ class TrajectoryRecorder:
         table = {name: np.concatenate([part[name] for part in self._parts]) for name in self._parts[0]}
         order = np.lexsort((table["uav"], table["t_s"], table["run"]))
         table = {name: values[order] for name, values in table.items()}
-        rows = len(order)
-        return {
-            "run": table.pop("run"),
-            "planner": np.full(rows, self._planner),
-            **table,
-            "slack_m": np.full(rows, np.nan),
-            "solver_status": np.full(rows, None, dtype=object),
-        }
+        return {"run": table.pop("run"), "planner": np.full(len(order), self._planner), **table}

@@ -100,10 +100,31 @@ def comparison(summary: dict[str, Any], reference: Reference | None = None) -> R
         "Metrics: median [5 %, 95 %] of the missions for which they are defined.",
         "joint success: reached, no contact of either kind, re-formed after the last obstacle.",
     ]
+    notes += [f"{name}: {note}" for name, p in planners.items() for note in _solver_notes(p)]
     notes += [_pair(pair) for pair in summary["paired"]]
     if reference is not None:
         notes += [_reference_note(reference)]
     return Rows(shown_text(summary["problem"], 200), ("", *planners), tuple(rows), tuple(notes))
+
+
+def _solver_notes(planner: dict[str, Any]) -> list[str]:
+    """What the solver did, and why runs did not finish."""
+    notes, solver = [], planner["solver"]
+    if solver["status"]:
+        solves = sum(solver["status"].values())
+        words = ", ".join(f"{count} {status}" for status, count in solver["status"].items())
+        steps = ", ".join(f"{count} {name}" for name, count in solver["fall_back_steps"].items())
+        notes.append(
+            f"{solves} programs: {words}; {solver['refused']} answers refused; steps on a fall-back: {steps}."
+        )
+        if solver["margin_short"]:
+            share = 100.0 * solver["margin_short"] / solves
+            notes.append(
+                f"in {share:.1f} % of UAV-steps the formation is too small for the margin between UAVs at "
+                "this confidence; they are kept apart by what its slots allow."
+            )
+    notes += [f"{count} runs did not finish: {word}." for word, count in planner["reasons"].items()]
+    return notes
 
 
 def _rate(planner: dict[str, Any], key: str, uavs: int = 1) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.evaluate import METRICS, Outcome
+from napf_mpc.planners.tally import COLUMNS, COUNTED, FALL_BACKS
 from napf_mpc.risk import Rate, clustered_rate, paired_tests, quantiles, wilson
 
 Columns = dict[str, NDArray[Any]]
@@ -55,8 +56,26 @@ def _planner_summary(part: Columns) -> dict[str, Any]:
         "finished": int(part["finished"].sum()) / runs,
         "joint_success": int(part["joint_success"].sum()) / runs,
         **{name: quantiles(np.asarray(part[name], dtype=float)) for name in METRICS},
-        # What a planner without a solver says; one with a solver fills it in.
-        "solver": {"status": {}, "iterations": None, "fall_backs": 0},
+        "reasons": {
+            str(word): int((part["reason"] == word).sum()) for word in np.unique(part["reason"]) if word
+        },
+        "solver": _solver_summary(part),
+    }
+
+
+def _solver_summary(part: Columns) -> dict[str, Any]:
+    """Counts of all runs; a planner without a solver has none."""
+    total = {name: int(part[name].sum()) for name in COLUMNS}
+    status = {s.value: total[f"solves_{s.value}"] for s in COUNTED if total[f"solves_{s.value}"]}
+    fall_backs = {name: total[f"fall_back_{name}"] for name in FALL_BACKS}
+    return {
+        "status": status,
+        "iterations": total["iterations"] if status else None,
+        "refused": total["answers_refused"],
+        "fall_backs": sum(fall_backs.values()),
+        "fall_back_steps": fall_backs,
+        "margin_short": total["margin_short"],
+        "largest_slack_m": quantiles(np.asarray(part["largest_slack_m"], dtype=float)),
     }
 
 

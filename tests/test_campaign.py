@@ -341,7 +341,11 @@ def test_the_summary_keeps_its_contract(hundred: Path) -> None:
         assert planner["uav_collision_risk_low"] < planner["uav_collision_risk_high"]
         assert planner["finished"] == mine["finished"].mean()
         assert planner["joint_success"] == mine["joint_success"].mean()
-        assert planner["solver"] == {"status": {}, "iterations": None, "fall_backs": 0}
+        assert planner["reasons"] == {}
+        solver = planner["solver"]
+        assert (solver["status"], solver["iterations"], solver["fall_backs"]) == ({}, None, 0)
+        assert solver["fall_back_steps"] == {"tail": 0, "hover": 0, "descend": 0}
+        assert (solver["refused"], solver["margin_short"], solver["largest_slack_m"]["n"]) == (0, 0, 0)
         for metric in METRICS:
             defined = mine[metric][np.isfinite(mine[metric])]
             assert list(planner[metric]) == ["median", "p05", "p95", "mean", "n"]
@@ -441,7 +445,7 @@ def test_simulate_takes_the_runs_of_the_campaign(hundred: Path) -> None:
     assert flown.trajectories == {}
 
 
-@pytest.mark.parametrize("planner", ["qp", "nonsense", ""])
+@pytest.mark.parametrize("planner", ["pq", "nonsense", ""])
 def test_a_planner_that_is_not_there_is_refused_before_anything_is_written(
     planner: str, tmp_path: Path
 ) -> None:

@@ -106,6 +106,13 @@ class NeighbourSeparation:
     """Part of the correction that each UAV of a pair takes, 0.5 to 1."""
     inflation: Inflation | None = None
     """How k sigma enters; by default as the problem's planner section says."""
+    slot_part: float | None = None
+    """The distance asked of a pair is at most this part of the distance of their slots (but never less than
+    d_n): a margin that the formation itself cannot keep would push all UAVs off their slots for good, see
+    :func:`margin_attainable`. None asks for all of it."""
+    opening_mps: float | None = None
+    """A gap that is short now is asked to open at this speed, not at once: UAVs that take off side by side
+    part calmly. None asks at once [m/s]."""
     reach_m: float = 20.0
     """Neighbours whose gap beyond the required distance is this or more are left out [m]."""
     w1: float = SEPARATION_W1
@@ -121,6 +128,9 @@ class NeighbourSeparation:
             )
         if self.distance_m is not None and not self.distance_m >= 0.0:
             raise ConstraintError(f"distance_m = {self.distance_m!r}, must be >= 0")
+        for name, value in (("slot_part", self.slot_part), ("opening_mps", self.opening_mps)):
+            if value is not None and not value >= 0.0:
+                raise ConstraintError(f"{name} = {value!r}, must be >= 0, or None")
 
     @property
     def name(self) -> str:
@@ -140,6 +150,7 @@ class NeighbourSeparation:
             horizon.covariance.transpose(0, 2, 1, 3, 4), horizon.common_factor[:, None]
         )
         required = reach + _margin(inflation, relative, normal)
+        required = np.maximum(reach, np.minimum(required, self._largest(horizon, offset[:, :1])))
         gap = _dot(normal, offset)
         spare = gap - required
         spare[..., np.arange(uavs), np.arange(uavs)] = np.inf
@@ -162,6 +173,23 @@ class NeighbourSeparation:
         return LinearRows(
             "position", padded_jac, padded_lower, None, np.full(shape, self.w1), np.full(shape, self.w2)
         )
+
+    def _largest(self, horizon: Horizon, offset: Array) -> Array:
+        """Most that is asked of pairs (run, N, uav, neighbour), whose offset now is (run, 1, uav, uav, 3)."""
+        most = np.full((1, 1, 1, 1), np.inf)
+        if self.slot_part is not None:
+            apart = slot_offsets(horizon.problem, horizon.frame)
+            most = self.slot_part * np.sqrt(_dot(apart, apart))
+        if self.opening_mps is not None:
+            now = np.sqrt(_dot(offset, offset))
+            most = np.minimum(most, now + self.opening_mps * np.cumsum(horizon.step_s)[:, None, None])
+        return most
+
+
+def slot_offsets(problem: Problem, frame: PathFrame) -> Array:
+    """From each slot of the formation to each other one, (uav, uav, 3) in the world [m]."""
+    slots = frame.to_world(formation_offsets(problem.formation))
+    return np.asarray(slots[:, None, :] - slots[None, :, :])
 
 
 def margin_attainable(
@@ -197,9 +225,8 @@ def margin_attainable(
     if not isinstance(problem.mission, FormationMission):
         raise ConstraintError('mission.kind must be "formation": a lone point has no neighbours')
     frame = PathFrame.of_mission(problem.mission)
-    slots = frame.to_world(formation_offsets(problem.formation))
-    offset = slots[:, None, :] - slots[None, :, :]
-    uavs = len(slots)
+    offset = slot_offsets(problem, frame)
+    uavs = len(offset)
     normal, reach = tangent(offset, _distance(distance_m, problem), stretch, _aside(uavs, frame))
     relative = relative_covariance(covariance, common_factor)
     margin = _margin(

@@ -33,6 +33,8 @@ class NavSolution:
     """(run, uav, 6, 6) of position and velocity, as reported [m^2, m^2/s, m^2/s^2]."""
     common_factor: Array
     """(run, uav, 3, rank) factor L of the part that UAVs share: Sigma_ij = L_i L_j^T [m]."""
+    airborne: NDArray[np.bool_] | None = None
+    """(run, uav): whether the UAV still flies its mission, so a planner has to work for it; None for all."""
 
     @property
     def position_covariance(self) -> Array:

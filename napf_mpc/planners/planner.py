@@ -3,15 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.plan import Plan
+from napf_mpc.planners.tally import Tally
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
+
+
+class Reason(IntEnum):
+    """Why a UAV waits; what is written of a run is that of its UAV with the largest code."""
+
+    NONE = 0
+    """It does not."""
+    WAITING = 1
+    """There is no way now; errors or others may clear it."""
+    NAVIGATION = 2
+    """Its navigation is not to be trusted."""
+    SOLVER = 3
+    """No answer of the solver could be flown for too long."""
+    NO_PASSAGE = 4
+    """There is no safe passage at this confidence."""
+
+
+REASON_WORDS = {
+    Reason.NONE: "",
+    Reason.WAITING: "waits for a safe passage",
+    Reason.NAVIGATION: "navigation not to be trusted",
+    Reason.SOLVER: "no plan accepted",
+    Reason.NO_PASSAGE: "no safe passage at this confidence",
+}
 
 
 @dataclass(frozen=True)
@@ -30,10 +57,23 @@ class Command:
     """(run, uav): hovering because the planner has no navigation that it trusts, or no way."""
     feedforward: Array
     """(run, uav, 4) inputs about hover [N, N m]; zero where the planner leaves them to the feedback."""
+    plan: Plan | None = None
+    """Plans over time: the inner loop then flies ``u_plan(t) - K (x_nav - x_plan(t))``."""
+    planned: NDArray[np.bool_] | None = None
+    """(run, uav): whose plan is to be flown; the others follow path point, velocity and direction."""
+    reason: NDArray[np.int8] | None = None
+    """(run, uav) codes of :class:`Reason`: why a UAV does not fly on as asked."""
+    slack_m: Array | None = None
+    """(run, uav) most that the flown plan is inside an obstacle's margin [m]."""
+    solver_status: NDArray[np.str_] | None = None
+    """(run, uav) word of the solver for this step's program."""
 
 
 class Planner(Protocol):
-    """A planner flies all runs in lock-step and owns its memory between steps."""
+    """A planner flies all runs in lock-step and owns its memory between steps.
+
+    One with a solver also has an attribute ``tally``, a :class:`~napf_mpc.planners.tally.Tally`.
+    """
 
     @property
     def name(self) -> str:
@@ -55,3 +95,9 @@ class Planner(Protocol):
     def step(self, nav: NavSolution, time_s: float) -> Command:
         """Command from what navigation reports; called at the planner's rate."""
         ...
+
+
+def tally_of(planner: Planner, runs: int) -> Tally:
+    """What a planner's solver did in each run; zeros for a planner that has none."""
+    tally = getattr(planner, "tally", None)
+    return tally if isinstance(tally, Tally) else Tally.none(runs)

@@ -10,10 +10,15 @@ from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner
 from napf_mpc.problem import Problem
 from napf_mpc.words import did_you_mean, shown_text
 
-PLANNERS: dict[str, Callable[[Problem], Planner]] = {"apf": ApfPlanner, "napf": NapfPlanner}
+
+def _qp(problem: Problem) -> Planner:
+    from napf_mpc.planners.mpc import QpPlanner  # with a solver's start-up time
+
+    return QpPlanner(problem)
+
+
+PLANNERS: dict[str, Callable[[Problem], Planner]] = {"apf": ApfPlanner, "napf": NapfPlanner, "qp": _qp}
 """Name -> factory."""
-ANNOUNCED = ("qp",)
-"""Names that problem files may hold, but that this version cannot fly."""
 
 
 def make_planner(name: str, problem: Problem) -> Planner:
@@ -22,10 +27,9 @@ def make_planner(name: str, problem: Problem) -> Planner:
     Raises
     ------
     ProblemError
-        If there is no planner of that name in this version.
+        If there is no planner of that name.
     """
     if name not in PLANNERS:
-        reason = "is not built in this version" if name in ANNOUNCED else "is not a planner"
         choice = f"choose from {', '.join(PLANNERS)}{did_you_mean(name, PLANNERS)}"
-        raise ProblemError("planner", [f'"{shown_text(name)}" {reason}; {choice}'])
+        raise ProblemError("planner", [f'"{shown_text(name)}" is not a planner; {choice}'])
     return PLANNERS[name](problem)

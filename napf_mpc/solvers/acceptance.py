@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napf_mpc.qp import INPUTS, Array, HorizonModel, QpError, QpStatus
+from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult
 
 PRIMAL_LIMIT = 0.01
@@ -114,6 +114,8 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
     finite = np.isfinite(result.states).all(axis=(2, 3)) & np.isfinite(result.inputs).all(axis=(2, 3))
     for slack in result.slacks:
         finite &= np.isfinite(slack).all(axis=(2, 3))
+    # A row that is off by what a row may be off costs its multiplier times that.
+    push = np.abs(result.y[..., result.states.shape[-2] * STATES :]).max(-1, initial=0.0)
     # Each test must hold to pass: NaN fails all of them.
     tests = (
         (Refusal.SKIPPED, result.status != STATUSES.index(QpStatus.SKIPPED)),
@@ -122,7 +124,7 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
         (Refusal.INPUT, inside),
         (Refusal.PRIMAL, result.primal <= limits.primal),
         (Refusal.DUAL, result.dual <= limits.dual),
-        (Refusal.COMPLEMENTARITY, result.complementarity <= limits.complementarity),
+        (Refusal.COMPLEMENTARITY, result.complementarity <= limits.complementarity + PRIMAL_LIMIT * push),
     )
     why = np.full(result.status.shape, Refusal.NONE, dtype=np.int8)
     for refusal, passed in reversed(tests):

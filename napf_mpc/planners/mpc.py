@@ -1,0 +1,304 @@
+"""QP-NAPF: a model-predictive planner whose soft rows carry the NAPF repulsion; one QP a UAV and step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
+from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
+from napf_mpc.constraints.limits import RotorLimits, SpeedLimit, TiltLimit
+from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
+from napf_mpc.errors import ProblemError
+from napf_mpc.formation import PathFrame
+from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
+from napf_mpc.planners.guide import Guide
+from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
+from napf_mpc.planners.planner import Command, Reason
+from napf_mpc.planners.references import SlotReference
+from napf_mpc.planners.tally import COUNTED, FALL_BACKS, Tally
+from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.problem import Planner as Settings
+from napf_mpc.qp import STATES, HorizonQp
+from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals
+from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, make_batch_solver
+from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
+from napf_mpc.world.obstacles import ObstacleSet
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+POSITION, VELOCITY = slice(0, 6, 2), slice(1, 6, 2)
+NEIGHBOURS = 3
+"""Neighbours that each stage of each UAV keeps rows for, at most."""
+SLOT_PART, OPENING_MPS = 0.7, 1.0
+"""What is asked of neighbours at most: this part of the distance of their slots, and no faster parting."""
+SPEED_PRICE = (1000.0, 1000.0)
+"""Prices of a speed slack: above what the margins can gain by it, so that no margin buys a dash."""
+_CAUSES = np.array([reason.name.lower() for reason in Refusal])
+_WORDS = np.array([status.value for status in STATUSES])
+
+
+def default_constraints(problem: Problem) -> list[Constraint]:
+    """Rows of the QP as a problem's settings ask for them."""
+    settings = problem.planner
+    rows, price = settings.obstacle_rows, settings.contact_price
+    contact = ObstacleContact(obstacles=rows, w1=price, extra_m=settings.contact_extra_m)
+    influence = ObstacleInfluence(obstacles=rows, per_speed=settings.influence_scale)
+    neighbours = min(NEIGHBOURS, problem.uav_count - 1)
+    apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
+    others: list[Constraint] = [apart] if neighbours else []
+    speed = SpeedLimit(w1=SPEED_PRICE[0], w2=SPEED_PRICE[1])
+    return [contact, influence, *others, speed, TiltLimit(), RotorLimits()]
+
+
+def weights(settings: Settings) -> tuple[Array, Array]:
+    """Diagonals (12,) of Q and (4,) of R per second, in the order of Eq. 1 and 2.
+
+    One weight for both horizontal axes, so that the Hessian depends neither on the heading nor on yaw.
+    """
+    state = np.empty(STATES)
+    state[POSITION], state[VELOCITY] = settings.position_weight, settings.velocity_weight
+    state[6:12:2], state[7:12:2] = settings.attitude_weight, 0.2 * settings.attitude_weight
+    return state, np.array([settings.thrust_weight, *[settings.torque_weight] * 3])
+
+
+class QpPlanner:
+    """Each UAV tracks its synchronised slot by a QP over a horizon; constraints are soft rows.
+
+    Every step the last plans, re-sampled, are the guess at which rows are linear; the constraints give their
+    rows; the solver answers; and an answer flies only if it passes the acceptance test. Otherwise the ladder
+    of :mod:`napf_mpc.planners.fallback` decides, and its use is counted. Neighbours see each other's plans of
+    the step before, so their order does not matter.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation, mission and planner settings.
+    constraints : sequence of Constraint, optional
+        Rows of the QP instead of :func:`default_constraints`.
+    solver : str or BatchSolver, optional
+        A solver, or the name of one, instead of the problem's.
+    name : str
+        Name in tables and files.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        constraints: Sequence[Constraint] | None = None,
+        solver: str | BatchSolver | None = None,
+        name: str = "qp",
+    ) -> None:
+        if not isinstance(problem.mission, FormationMission):
+            raise ProblemError("mission.kind", ['must be "formation" for this planner, not "goal"'])
+        settings = problem.planner
+        self.problem = problem
+        self.constraints = list(default_constraints(problem) if constraints is None else constraints)
+        self._name = name
+        self._frame = PathFrame.of_mission(problem.mission)
+        self._slots = SlotReference.of_problem(problem, problem.mission)
+        self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
+        step = stage_grid(1.0 / settings.rate_hz, settings.horizon, settings.look_ahead_s)
+        self._yaw = self._frame.heading_rad
+        self._model = horizon_model(problem.vehicle, self._yaw, step, *weights(settings))
+        chosen = settings.solver if solver is None else solver
+        self._solver = make_batch_solver(chosen) if isinstance(chosen, str) else chosen
+        hover = mixer_inverse(problem.vehicle) @ hover_input(problem.vehicle)
+        self._limits = AcceptanceLimits.of(
+            self._model, mixer_inverse(problem.vehicle), -hover, rotor_limit(problem.vehicle) - hover
+        )
+        self.reset(ObstacleSet.empty(), 0)
+
+    @property
+    def name(self) -> str:
+        """Name in tables and files."""
+        return self._name
+
+    def reset(self, obstacles: ObstacleSet, runs: int) -> None:
+        """Take a new map; forget plans, workspaces and fall-backs."""
+        uavs = len(self._lanes)
+        self._obstacles = obstacles
+        self._solver.reset()
+        self._plan: Plan | None = None
+        self._answer: BatchResult | None = None
+        self._made_s: Array = np.full((runs, uavs), -np.inf)
+        self._anchor: Array = np.repeat(self._lanes[None], runs, axis=0)
+        self.ladder = Ladder(runs, uavs)
+        self.tally = Tally.none(runs)
+
+    def build(self, nav: NavSolution, time_s: float) -> HorizonQp:
+        """Programs of this step, in coordinates whose origin is each UAV's reported position."""
+        trusted = nav.trusted()
+        state = self._state(nav, trusted)
+        reference = self._slots.over(state[..., POSITION], self._model.times_s)
+        guess, _ = self._guess(state, reference, time_s)
+        return self._programs(state, reference, self._horizon(guess, nav, trusted, time_s))
+
+    def step(self, nav: NavSolution, time_s: float) -> Command:
+        """Solve this step's programs and command what was accepted, or what the ladder says."""
+        airborne = np.ones(nav.available.shape, dtype=bool) if nav.airborne is None else nav.airborne
+        trusted = nav.trusted() & airborne
+        self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
+        state = self._state(nav, trusted)
+        reference = self._slots.over(state[..., POSITION], self._model.times_s, self._guide(nav, trusted))
+        answer = self._solve(state, reference, nav, trusted, time_s)
+        refused = refusals(answer, self._limits)
+        accepted = (refused == Refusal.NONE) & trusted
+        causes = np.where(trusted, _CAUSES[refused], np.where(airborne, "navigation", ""))
+        flown, action = self._choose(time_s, state, answer, accepted, causes)
+        self._plan, self._answer = flown, answer
+        self._count(answer, action, accepted, trusted, airborne)
+        self._count_short_margins(nav, trusted)
+        on_plan = action <= Action.TAIL
+        down = np.where(action == Action.DESCEND, -DESCENT_MPS, 0.0)[..., None] * self._frame.up
+        planned = on_plan[..., None]
+        return Command(
+            position=np.where(planned, flown.initial[..., POSITION], self._anchor),
+            velocity=np.where(planned, flown.initial[..., VELOCITY], down),
+            direction=np.where(planned, 0.0, down),
+            yaw=np.full(trusted.shape, self._yaw),
+            holding=~on_plan,
+            feedforward=np.zeros((*trusted.shape, 4)),
+            plan=flown,
+            planned=on_plan,
+            reason=_reasons(action, trusted),
+            slack_m=self._contact_slack(answer, accepted),
+            solver_status=_WORDS[answer.status],
+        )
+
+    def _guide(self, nav: NavSolution, trusted: Mask) -> Guide | None:
+        return None
+
+    def _state(self, nav: NavSolution, trusted: Mask) -> Array:
+        """State (run, uav, 12) as reported; a UAV that is not trusted stands at its last known place."""
+        state = np.zeros((*trusted.shape, STATES))
+        state[..., POSITION] = self._anchor
+        state[..., 10] = self._yaw
+        known = np.empty_like(state)
+        known[..., POSITION], known[..., VELOCITY] = nav.position, nav.velocity
+        known[..., 6:12:2], known[..., 7:12:2] = nav.attitude, nav.body_rates
+        return np.where(trusted[..., None], known, state)
+
+    def _guess(self, state: Array, reference: Array, time_s: float) -> tuple[Array, Array]:
+        """States and inputs of the last plans on this step's grid, moved to where navigation is now."""
+        plan, step_s = self._plan, self._model.step_s
+        if plan is None:
+            velocity = reference[:, :, 0, VELOCITY]
+            plan = straight_plan(self.problem.vehicle, self._yaw, time_s, step_s, state, velocity)
+        states, inputs = plan.resampled(time_s, step_s)
+        states[..., POSITION] += (state - plan.at(time_s)[0])[:, :, None, POSITION]
+        return states, inputs
+
+    def _horizon(self, guess: Array, nav: NavSolution, trusted: Mask, time_s: float) -> Horizon:
+        known = trusted[..., None, None]
+        covariance = np.where(known, nav.position_covariance, np.eye(3))
+        return Horizon(
+            time_s=time_s,
+            step_s=self._model.step_s,
+            position=guess[..., POSITION],
+            velocity=guess[..., VELOCITY],
+            covariance=np.repeat(covariance[:, :, None], self._model.stages, axis=2),
+            common_factor=np.where(known, nav.common_factor, 0.0),
+            obstacles=self._obstacles,
+            frame=self._frame,
+            problem=self.problem,
+        )
+
+    def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
+        """Programs with each UAV's place as the origin: large coordinates would cost digits."""
+        origin = state[..., POSITION]
+        blocks: list[LinearRows] = [constraint.rows(horizon) for constraint in self.constraints]
+        blocks = [block.shifted(origin) if block.signal == "position" else block for block in blocks]
+        return HorizonQp(
+            self._model, _moved(state, -origin), _moved(reference, -origin[:, :, None]), tuple(blocks)
+        )
+
+    def _solve(
+        self, state: Array, reference: Array, nav: NavSolution, trusted: Mask, time_s: float
+    ) -> BatchResult:
+        """Answers in the world's coordinates, after as many passes as the problem asks for."""
+        states, inputs = self._guess(state, reference, time_s)
+        origin, answer = state[:, :, None, POSITION], self._answer
+        asked: Mask = np.asarray(trusted.any(-1))
+        for turn in range(self.problem.planner.passes):
+            if turn and answer is not None:
+                better = np.asarray(np.isfinite(answer.states).all(axis=(2, 3), keepdims=True))
+                states = np.where(better, _moved(answer.states, origin), states)
+                inputs = np.where(better, answer.inputs, inputs)
+            programs = self._programs(state, reference, self._horizon(states, nav, trusted, time_s))
+            warm = None if answer is None else answer.warm_start(_moved(states, -origin), inputs)
+            answer = self._solver.solve_batch(programs, warm, asked)
+        assert answer is not None
+        return answer
+
+    def _choose(
+        self, time_s: float, state: Array, answer: BatchResult, accepted: Mask, causes: NDArray[np.str_]
+    ) -> tuple[Plan, Codes]:
+        """Plans that fly from now on, and by which rung of the ladder."""
+        old, step_s = self._plan, self._model.step_s
+        still = standing_plan(self.problem.vehicle, self._yaw, time_s, step_s, self._anchor)
+        new = Plan(
+            self.problem.vehicle, self._yaw, time_s, step_s, state,
+            _moved(answer.states, state[:, :, None, POSITION]), answer.inputs,
+        )  # fmt: skip
+        if accepted.all():
+            self._made_s[:] = time_s
+            no_need = np.zeros(accepted.shape, dtype=bool)
+            return new, self.ladder.decide(time_s, accepted, self._made_s, no_need, causes)
+        tail = still if old is None else old.resumed(time_s, step_s)
+        clear = self._clearance(tail) >= 0.0
+        action = self.ladder.decide(time_s, accepted, time_s - self._made_s, clear, causes)
+        self._made_s = np.where(accepted, time_s, self._made_s)
+        return new.where(accepted, tail.where(action == Action.TAIL, still)), action
+
+    def _clearance(self, plan: Plan) -> Array:
+        """Least distance (run, uav) of a plan's nodes to the obstacles, less the radius [m]."""
+        runs, uavs, stages = plan.states.shape[:3]
+        points = np.ascontiguousarray(plan.states[..., POSITION].reshape(runs, uavs * stages, 3))
+        distance = self._obstacles.signed_distance(points).reshape(runs, uavs, stages)
+        return np.asarray(distance.min(-1) - self.problem.vehicle.radius_m)
+
+    def _count(
+        self, answer: BatchResult, action: Codes, accepted: Mask, trusted: Mask, airborne: Mask
+    ) -> None:
+        tally = self.tally
+        for status in COUNTED:
+            tally.add(f"solves_{status.value}", trusted & (answer.status == STATUSES.index(status)))
+        tally.add("iterations", trusted, np.maximum(answer.iterations, 0))
+        tally.add("answers_refused", trusted & ~accepted)
+        for rung, name in enumerate(FALL_BACKS, start=1):
+            tally.add(f"fall_back_{name}", airborne & (action == rung))
+        slack = np.fmax.reduce(self._contact_slack(answer, accepted), axis=-1)
+        np.fmax(tally.largest_slack_m, slack, out=tally.largest_slack_m)
+
+    def _contact_slack(self, answer: BatchResult, accepted: Mask) -> Array:
+        """Most that each new plan (run, uav) is inside an obstacle's margin, NaN without one [m]."""
+        most = np.full(accepted.shape, np.nan)
+        for constraint, slack in zip(self.constraints, answer.slacks, strict=True):
+            if isinstance(constraint, ObstacleContact):
+                most = np.fmax(most, slack.max(axis=(2, 3), initial=0.0))
+        return np.where(accepted, most, np.nan)
+
+    def _count_short_margins(self, nav: NavSolution, trusted: Mask) -> None:
+        """Count UAVs whose margin to some other UAV the formation itself, flown perfectly, could not keep."""
+        if len(self._lanes) > 1:
+            known = trusted[..., None, None]
+            covariance = np.where(known, nav.position_covariance, 0.0)
+            kept = margin_attainable(self.problem, covariance, np.where(known, nav.common_factor, 0.0))
+            self.tally.add("margin_short", trusted & ~kept.all(-1))
+
+
+def _reasons(action: Codes, trusted: Mask) -> Codes:
+    waiting = action > Action.TAIL
+    return np.where(waiting, np.where(trusted, Reason.SOLVER, Reason.NAVIGATION), Reason.NONE).astype(np.int8)
+
+
+def _moved(states: Array, by: Array) -> Array:
+    """States (..., 12) with their positions moved by (..., 3)."""
+    out = states.copy()
+    out[..., POSITION] += by
+    return out

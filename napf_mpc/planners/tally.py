@@ -1,0 +1,48 @@
+"""What a planner with a solver did in each run: solves by status, iterations, fall-backs, largest slack."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.quadratic_program import QpStatus
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+COUNTED = tuple(status for status in QpStatus if status is not QpStatus.SKIPPED)
+FALL_BACKS = ("tail", "hover", "descend")
+"""What flew instead of a new plan, see :class:`napf_mpc.planners.fallback.Action`."""
+COLUMNS = (
+    *(f"solves_{status.value}" for status in COUNTED),
+    "iterations",
+    "answers_refused",
+    *(f"fall_back_{name}" for name in FALL_BACKS),
+    "margin_short",
+)
+"""Counts of a run, summed over UAVs and planner steps."""
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Counts of each run of a block."""
+
+    counts: dict[str, NDArray[np.int64]]
+    """Name of :data:`COLUMNS` -> (run,)."""
+    largest_slack_m: Array
+    """(run,) most that a flown plan is inside an obstacle's margin, NaN if none was asked for [m]."""
+
+    @classmethod
+    def none(cls, runs: int) -> Tally:
+        """Tally of a planner that solves nothing."""
+        return cls({name: np.zeros(runs, dtype=np.int64) for name in COLUMNS}, np.full(runs, np.nan))
+
+    def columns(self) -> dict[str, NDArray[np.int64] | Array]:
+        """Columns of ``runs.parquet``."""
+        return {**self.counts, "largest_slack_m": self.largest_slack_m}
+
+    def add(self, name: str, uavs: Mask, amount: NDArray[np.int64] | int = 1) -> None:
+        """Count UAVs (run, uav), once each or by an amount (run, uav)."""
+        self.counts[name] += np.where(uavs, amount, 0).sum(-1)
