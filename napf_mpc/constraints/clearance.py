@@ -19,7 +19,6 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc import apf
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins
 from napf_mpc.safety_distance import Inflation
@@ -202,16 +201,15 @@ class ObstacleContact(_Shell):
 
 @dataclass(frozen=True)
 class ObstacleInfluence(_Shell):
-    r"""Influence shell: NAPF's repulsion inside rho_0, as a quadratic penalty on ``rho_bar >= rho_0 - s``.
+    r"""Influence shell: NAPF's repulsion inside rho_0, as a quadratic penalty on ``rho_bar >= rho_t - s``.
 
-    The weight is FIRAS's force over the remaining distance, frozen at the last plan,
-
-        w2 = c k_r (1/rho - 1/rho_0) / rho^2 / (rho_0 - rho_bar) = c k_r / (rho_0 rho_bar^3),
-
-    rho being rho_bar, but at least the least distance of Eq. 28. At the last plan the slack is
-    rho_0 - rho_bar, so that minus the gradient of w2 s^2 / 2 by the position is c times NAPF's force along n:
-    its magnitude (Eq. 28), its direction (Eq. 29) and, over the rows, its sum (Eq. 36). Beyond rho_0, where
-    NAPF does nothing, w2 is the slope of the force at rho_0: it counts only once a plan comes nearer.
+    NAPF's potential is convex in rho_bar. The row is its second-order model at the last plan: with the force
+    F of Eq. 28 there and its slope F', the weight is ``w2 = c |F'|`` and the target ``rho_t = rho_bar +
+    F / |F'|``, so that minus the gradient of w2 s^2 / 2 by the position is c times NAPF's force along n: its
+    magnitude (Eq. 28), its direction (Eq. 29) and, over the rows, its sum (Eq. 36). A weight of F over the
+    whole distance left to rho_0 has the same force but a third of the slope: the plan then leaps between
+    contact and rho_0 from step to step. Beyond rho_0, where NAPF does nothing, the target is rho_0 and the
+    weight the slope there: it counts only once a plan comes nearer.
     """
 
     per_speed: float = 1.0
@@ -228,18 +226,19 @@ class ObstacleInfluence(_Shell):
         return "obstacle influence"
 
     def rows(self, horizon: Horizon) -> LinearRows:
-        """Rows ``n^T p >= n^T p_lin - rho_bar(p_lin) + rho_0 - s`` [m], each with a slack of its own."""
+        """Rows ``n^T p >= n^T p_lin + rho_t - rho_bar(p_lin) - s`` [m], each with a slack of its own."""
         settings = horizon.problem.planner
         gaps = self.gaps(horizon, settings.influence_m)
-        jac, lower = gaps.rows_beyond(horizon.position, gaps.influence)
-        w2 = self.per_speed * influence_weight(
+        weight, target = influence_model(
             gaps.shifted, settings.repulsive_gain, gaps.influence, settings.min_distance_m
         )
+        jac, lower = gaps.rows_beyond(horizon.position, target)
+        w2 = self.per_speed * weight
         free = w2 <= 0.0
         return LinearRows(
             "position",
             jac,
-            np.where(free, -np.inf, lower),
+            np.where(free | ~np.isfinite(gaps.shifted), -np.inf, lower),
             None,
             np.zeros(w2.shape),
             # A slack without a price would be undetermined; this one's row is switched off.
@@ -247,8 +246,10 @@ class ObstacleInfluence(_Shell):
         )
 
 
-def influence_weight(rho: Array, gain: float, influence_m: Array | float, floor_m: float) -> Array:
-    """Stiffness of the repulsion: FIRAS's force over the remaining distance (Eq. 28).
+def influence_model(
+    rho: Array, gain: float, influence_m: Array | float, floor_m: float
+) -> tuple[Array, Array]:
+    """Second-order model of the repulsive potential: stiffness, and the distance at which it is at rest.
 
     Parameters
     ----------
@@ -263,14 +264,13 @@ def influence_weight(rho: Array, gain: float, influence_m: Array | float, floor_
 
     Returns
     -------
-    array, shape (...)
-        k_r / (rho_0 rho^3) between the least distance and rho_0, no 0/0 at rho_0; the force at the least
-        distance over rho_0 - rho below it; k_r / rho_0^4 beyond rho_0.
+    weight : array, shape (...)
+        Slope of Eq. 28 at rho, at least the least distance and at most rho_0.
+    target : array, shape (...)
+        rho plus force over slope inside rho_0, rho_0 outside [m].
     """
     held = np.clip(rho, floor_m, influence_m)
-    remaining = np.where(rho < floor_m, influence_m - np.minimum(rho, floor_m), 1.0)
-    return np.where(
-        rho < floor_m,
-        apf.repulsion(held, gain, influence_m, floor_m) / remaining,
-        gain / (influence_m * held**3),
-    )
+    weight = gain * (3.0 - 2.0 * held / influence_m) / held**4
+    ahead = held * (1.0 - held / influence_m) / (3.0 - 2.0 * held / influence_m)
+    inside = np.where(rho < influence_m, rho, 0.0) + ahead
+    return np.asarray(weight), np.asarray(np.where(rho < influence_m, inside, influence_m))

@@ -182,6 +182,18 @@ class LinearRows:
         if faults:
             raise ConstraintError("; ".join(faults))
 
+    def check_shapes(self, shape: tuple[int, int, int], name: str) -> None:
+        """Refuse rows of a named constraint whose arrays do not fit a horizon of shape (run, uav, N).
+
+        Raises
+        ------
+        ConstraintError
+            Naming the constraint and everything that does not fit.
+        """
+        faults = [*self._shape_faults(shape)]
+        if faults:
+            raise ConstraintError(f"constraint {name!r}: {'; '.join(faults)}")
+
     def _shape_faults(self, shape: tuple[int, int, int]) -> Iterator[str]:
         if self.signal not in SIGNALS:
             yield f"signal {self.signal!r} is not known; choose from {', '.join(SIGNALS)}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
 from napf_mpc.constraints.limits import RotorLimits, SpeedLimit, TiltLimit
 from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
-from napf_mpc.errors import ProblemError
+from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
@@ -24,7 +24,7 @@ from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem import Planner as Settings
 from napf_mpc.qp import STATES, HorizonQp
 from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals
-from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, make_batch_solver
+from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
 from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
 from napf_mpc.world.obstacles import ObstacleSet
 
@@ -84,6 +84,9 @@ class QpPlanner:
         A solver, or the name of one, instead of the problem's.
     name : str
         Name in tables and files.
+    clock : callable, optional
+        Seconds that go on while the solver works. With one, answers that take longer than the planner's
+        period are refused as late; without, as in all simulations, time stands still meanwhile.
     """
 
     def __init__(
@@ -92,6 +95,7 @@ class QpPlanner:
         constraints: Sequence[Constraint] | None = None,
         solver: str | BatchSolver | None = None,
         name: str = "qp",
+        clock: Callable[[], float] | None = None,
     ) -> None:
         if not isinstance(problem.mission, FormationMission):
             raise ProblemError("mission.kind", ['must be "formation" for this planner, not "goal"'])
@@ -99,10 +103,12 @@ class QpPlanner:
         self.problem = problem
         self.constraints = list(default_constraints(problem) if constraints is None else constraints)
         self._name = name
+        self._clock = clock
         self._frame = PathFrame.of_mission(problem.mission)
         self._slots = SlotReference.of_problem(problem, problem.mission)
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
-        step = stage_grid(1.0 / settings.rate_hz, settings.horizon, settings.look_ahead_s)
+        self._period_s = 1.0 / settings.rate_hz
+        step = stage_grid(self._period_s, settings.horizon, settings.look_ahead_s)
         self._yaw = self._frame.heading_rad
         self._model = horizon_model(problem.vehicle, self._yaw, step, *weights(settings))
         chosen = settings.solver if solver is None else solver
@@ -145,11 +151,14 @@ class QpPlanner:
         self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
         state = self._state(nav, trusted)
         reference = self._slots.over(state[..., POSITION], self._model.times_s, self._guide(nav, trusted))
+        began = 0.0 if self._clock is None else self._clock()
         answer = self._solve(state, reference, nav, trusted, time_s)
+        late = self._clock is not None and not self._clock() - began <= self._period_s
         refused = refusals(answer, self._limits)
-        accepted = (refused == Refusal.NONE) & trusted
-        causes = np.where(trusted, _CAUSES[refused], np.where(airborne, "navigation", ""))
-        flown, action = self._choose(time_s, state, answer, accepted, causes)
+        accepted = (refused == Refusal.NONE) & trusted & (not late)
+        causes = np.where(late, "late", _CAUSES[refused])
+        causes = np.where(trusted, causes, np.where(airborne, "navigation", ""))
+        flown, action = self._choose(time_s, state, answer, accepted, trusted, causes)
         self._plan, self._answer = flown, answer
         self._count(answer, action, accepted, trusted, airborne)
         self._count_short_margins(nav, trusted)
@@ -212,6 +221,8 @@ class QpPlanner:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
         origin = state[..., POSITION]
         blocks: list[LinearRows] = [constraint.rows(horizon) for constraint in self.constraints]
+        for constraint, block in zip(self.constraints, blocks, strict=True):
+            block.check_shapes(horizon.shape, constraint.name)
         blocks = [block.shifted(origin) if block.signal == "position" else block for block in blocks]
         return HorizonQp(
             self._model, _moved(state, -origin), _moved(reference, -origin[:, :, None]), tuple(blocks)
@@ -231,12 +242,28 @@ class QpPlanner:
                 inputs = np.where(better, answer.inputs, inputs)
             programs = self._programs(state, reference, self._horizon(states, nav, trusted, time_s))
             warm = None if answer is None else answer.warm_start(_moved(states, -origin), inputs)
-            answer = self._solver.solve_batch(programs, warm, asked)
+            answer = self._answer_to(programs, warm, asked)
         assert answer is not None
         return answer
 
+    def _answer_to(self, programs: HorizonQp, warm: WarmStart | None, asked: Mask) -> BatchResult:
+        """Answer of the solver; one that fails altogether has failed in all programs."""
+        try:
+            return self._solver.solve_batch(programs, warm, asked)
+        except NapfError:
+            raise  # rows that do not fit, a model that is not sound: to be mended, not flown around
+        except Exception as error:
+            self._solver.reset()
+            return BatchResult.failed(programs, f"{type(error).__name__}: {error}")
+
     def _choose(
-        self, time_s: float, state: Array, answer: BatchResult, accepted: Mask, causes: NDArray[np.str_]
+        self,
+        time_s: float,
+        state: Array,
+        answer: BatchResult,
+        accepted: Mask,
+        trusted: Mask,
+        causes: NDArray[np.str_],
     ) -> tuple[Plan, Codes]:
         """Plans that fly from now on, and by which rung of the ladder."""
         old, step_s = self._plan, self._model.step_s
@@ -250,7 +277,8 @@ class QpPlanner:
             no_need = np.zeros(accepted.shape, dtype=bool)
             return new, self.ladder.decide(time_s, accepted, self._made_s, no_need, causes)
         tail = still if old is None else old.resumed(time_s, step_s)
-        clear = self._clearance(tail) >= 0.0
+        # Without navigation nothing tells whether the tail is followed.
+        clear = trusted & (self._clearance(tail) >= 0.0)
         action = self.ladder.decide(time_s, accepted, time_s - self._made_s, clear, causes)
         self._made_s = np.where(accepted, time_s, self._made_s)
         return new.where(accepted, tail.where(action == Action.TAIL, still)), action

@@ -64,6 +64,20 @@ class BatchResult:
     messages: dict[tuple[int, int], str] = field(default_factory=dict)
     """(run, uav) -> why it failed, in the solver's words."""
 
+    @classmethod
+    def failed(cls, horizon: HorizonQp, message: str) -> BatchResult:
+        """Result of a solver that answered nothing at all."""
+        runs, uavs, _ = horizon.shape
+        layout = Layout.of(horizon)
+        n, m = layout.sparsity.variables, layout.sparsity.constraints
+        z, infinite = np.full((runs, uavs, n), np.nan), np.full((runs, uavs), np.inf)
+        return cls(
+            np.full((runs, uavs), STATUSES.index(QpStatus.FAILED), dtype=np.int8),
+            layout.states(z), layout.inputs(z), layout.block_slacks(z), z, np.full((runs, uavs, m), np.nan),
+            infinite, infinite.copy(), infinite.copy(), np.full((runs, uavs), -1, dtype=np.int64),
+            {(run, uav): message for run in range(runs) for uav in range(uavs)},
+        )  # fmt: skip
+
     def counts(self) -> dict[str, int]:
         """How many programs had each status; skipped ones left out."""
         return {

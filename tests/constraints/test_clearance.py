@@ -13,7 +13,7 @@ from napf_mpc.constraints.clearance import (
     Gaps,
     ObstacleContact,
     ObstacleInfluence,
-    influence_weight,
+    influence_model,
 )
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.constraints.contract import check_constraint, sample_horizon, sample_worlds
@@ -229,14 +229,19 @@ def test_the_influence_rows_pull_with_napfs_force(mode: str, per_speed: float) -
         assert -slope[free] == pytest.approx(per_speed * force[free, axis], rel=1e-4, abs=1e-3)
 
 
-def test_the_stiffness_is_the_force_over_what_is_left_and_nothing_is_divided_by_zero() -> None:
+def test_the_influence_is_the_force_and_its_slope_and_nothing_is_divided_by_zero() -> None:
     rho = np.array([-4.0, 0.0, 0.05, 0.1, 0.5, 2.999999, 3.0, 3.1, 50.0, np.inf])
-    weight = influence_weight(rho, 15.0, 3.0, 0.1)
+    weight, target = influence_model(rho, 15.0, 3.0, 0.1)
     force = apf.repulsion(rho, 15.0, 3.0, 0.1)
-    assert weight * np.maximum(3.0 - rho, 0.0) == pytest.approx(force, rel=1e-9, abs=1e-9)
-    assert weight[4] == pytest.approx(15.0 / (3.0 * 0.5**3))
+    left = np.where(np.isfinite(rho), target - np.minimum(rho, target), 0.0)
+    assert weight * left == pytest.approx(force, rel=1e-9, abs=1e-9)
+    for at in (0.2, 0.5, 1.5, 2.9):
+        slope = np.diff(apf.repulsion(at + np.array([-1e-5, 1e-5]), 15.0, 3.0, 0.1))[0] / 2e-5
+        assert influence_model(np.array([at]), 15.0, 3.0, 0.1)[0][0] == pytest.approx(-slope, rel=1e-6)
     assert weight[6:] == pytest.approx(15.0 / 3.0**4)
-    assert (influence_weight(rho, 15.0, 3.0, 3.0)[:6] == 0.0).all()
+    assert target[6:] == pytest.approx(3.0)
+    at_floor, rest = influence_model(rho, 15.0, 3.0, 3.0)
+    assert at_floor * (rest - np.minimum(rho, rest)) == pytest.approx(0.0, abs=1e-9, nan_ok=True)
 
 
 def test_a_field_without_gain_switches_the_influence_off() -> None:
@@ -362,7 +367,9 @@ def test_a_wide_field_reaches_beyond_the_contact_rows() -> None:
     wide = problem(influence_m=40.0, k=1.0)
     horizon = hover_at((0.0, 0.0, 50.0), [Sphere((30.0, 0.0, 50.0), 2.0)], of=wide)
     rows = ObstacleInfluence(reach_m=5.0).rows(horizon)
-    assert rows.violation(horizon.position)[0, 0, 0, 0] == pytest.approx(40.0 - 27.5)
+    assert rows.violation(horizon.position)[0, 0, 0, 0] == pytest.approx(
+        27.5 * (1.0 - 27.5 / 40.0) / (3.0 - 55.0 / 40.0)  # force over slope
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,344 @@
+"""The QP planner keeps what it is asked to; whatever its solver does, what flies is sound and counted."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from napf_mpc.block import simulate
+from napf_mpc.constraints.constraint import Horizon, LinearRows
+from napf_mpc.constraints.limits import TiltLimit
+from napf_mpc.errors import NapfError, ProblemError
+from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.fallback import Action
+from napf_mpc.planners.mpc import QpPlanner, default_constraints
+from napf_mpc.planners.planner import Command, Reason
+from napf_mpc.problem import Problem
+from napf_mpc.problem_file import load_problem
+from napf_mpc.qp import HorizonQp
+from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
+from napf_mpc.vehicle.quadrotor import mixer_inverse, rotor_limit
+from napf_mpc.world.obstacles import ObstacleSet
+from napf_mpc.world.shapes import Box, Sphere
+
+SHORT = {"mission": {"length_m": 12.0}, "simulation": {"time_limit_s": 12.0}}
+
+
+def problem(**changes: object) -> Problem:
+    settings = {"planner": {"kind": "qp"}} | SHORT
+    return load_problem("study_8s", settings | changes)
+
+
+def nav(
+    position: np.ndarray, velocity: np.ndarray | None = None, sigma_m: float = 0.3, time_s: float = 0.0
+) -> NavSolution:
+    shape = position.shape[:2]
+    covariance = np.zeros((*shape, 6, 6))
+    covariance[..., :3, :3] = sigma_m**2 * np.eye(3)
+    return NavSolution(
+        time_s=time_s,
+        available=np.ones(shape, dtype=bool),
+        position=position,
+        velocity=np.zeros_like(position) if velocity is None else velocity,
+        attitude=np.zeros((*shape, 3)),
+        body_rates=np.zeros((*shape, 3)),
+        covariance=covariance,
+        common_factor=np.zeros((*shape, 3, 1)),
+    )
+
+
+def on_slots(planner: QpPlanner, along_m: float = 0.0) -> np.ndarray:
+    return (
+        planner._lanes + planner._slots.offsets[:, :1] * planner._frame.along + along_m * planner._frame.along
+    )[None]
+
+
+def cruising(planner: QpPlanner) -> np.ndarray:
+    return np.broadcast_to(2.0 * planner._frame.along, (1, 4, 3)).copy()
+
+
+# ------------------------------------------------------------------------------------------ what it plans
+
+
+def test_on_the_slots_in_free_air_the_plan_is_to_fly_straight_on_with_hover_thrust() -> None:
+    planner = QpPlanner(problem())
+    planner.reset(ObstacleSet.empty(), 1)
+    command = planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
+    assert command.plan is not None
+    times = np.cumsum(command.plan.step_s)
+    straight = on_slots(planner)[:, :, None] + 2.0 * times[:, None] * planner._frame.along
+    np.testing.assert_allclose(command.plan.states[..., 0:6:2], straight, atol=1e-3)
+    np.testing.assert_allclose(command.plan.inputs, 0.0, atol=1e-3)
+    assert not command.holding.any()
+
+
+def test_a_plan_keeps_k_sigma_and_its_radius_clear_of_a_wall_beside_the_lane() -> None:
+    asked = problem(planner={"kind": "qp", "influence_scale": 1e-6})
+    planner = QpPlanner(asked)
+    slots = on_slots(planner)
+    # A long wall whose face is half a metre inside the left-most lane's margin of 3 * 0.3 + 0.3 m.
+    face = slots[0, :, 1].max() + 0.7
+    wall = Box((50.0, face + 1.0, 0.0), (200.0, 2.0, 50.0), 0.0)
+    planner.reset(ObstacleSet.from_shapes([wall]), 1)
+    solution = nav(slots, cruising(planner))
+    for tick in range(80):
+        command = planner.step(solution, 0.1 * tick)
+        assert command.plan is not None
+        state, _ = command.plan.at(0.1 * (tick + 1))
+        solution = replace(
+            solution, position=state[..., 0:6:2], velocity=state[..., 1:6:2], attitude=state[..., 6:12:2],
+            body_rates=state[..., 7:12:2],
+        )  # fmt: skip
+    position = solution.position
+    at = int(slots[0, :, 1].argmax())
+    assert face - position[0, at, 1] == pytest.approx(0.3 + 3.0 * 0.3, abs=0.02)
+    others = [uav for uav in range(4) if uav != at]
+    np.testing.assert_allclose(position[0, others, 1], slots[0, others, 1], atol=0.35)
+
+
+def test_a_command_does_not_depend_on_which_other_runs_are_flown_with_it() -> None:
+    flown = problem()
+    alone = simulate(flown, "qp", seed=11, runs=range(1, 2), record_every=5)
+    together = simulate(flown, "qp", seed=11, runs=range(0, 3), record_every=5)
+    second = together.trajectories["run"] == 1
+    for name in ("x_m", "y_m", "z_m", "thrust_n", "slack_m"):
+        np.testing.assert_array_equal(alone.trajectories[name], together.trajectories[name][second])
+    assert alone.tally.counts["iterations"][0] == together.tally.counts["iterations"][1]
+
+
+def test_a_planner_flown_again_flies_the_same() -> None:
+    planner = QpPlanner(problem())
+    first, again = (simulate(problem(), planner, seed=11, runs=1, record_every=5) for _ in range(2))
+    np.testing.assert_array_equal(first.trajectories["x_m"], again.trajectories["x_m"])
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 90.0, 200.0])
+def test_turning_the_world_turns_the_plan(heading_deg: float) -> None:
+    level = problem(
+        mission={
+            "heading_deg": 0.0,
+            "initial_positions_m": None,
+            "initial_velocities_mps": None,
+            "length_m": 12.0,
+        }
+    )
+    turned = problem(
+        mission={
+            "heading_deg": heading_deg, "initial_positions_m": None, "initial_velocities_mps": None,
+            "length_m": 12.0,
+        }
+    )  # fmt: skip
+    plans = []
+    for asked in (level, turned):
+        planner = QpPlanner(asked)
+        frame = planner._frame
+        ball = frame.to_world(np.array([[6.0, 3.5, 0.2]]))[0]
+        planner.reset(ObstacleSet.from_shapes([Sphere(tuple(ball), 1.0)]), 1)
+        start = nav(on_slots(planner, -3.0), cruising(planner))
+        yawed = np.zeros((1, 4, 3))
+        yawed[..., 2] = frame.heading_rad
+        command = planner.step(replace(start, attitude=yawed), 0.0)
+        assert command.plan is not None
+        plans.append(frame.to_path(command.plan.states[..., 0:6:2]))
+    np.testing.assert_allclose(plans[1], plans[0], atol=5e-3)
+
+
+def test_more_passes_leave_less_between_the_rows_and_the_plan() -> None:
+    """Rows are linear at the guess: after a second pass the guess is nearly the answer."""
+    moved = []
+    for passes in (1, 3):
+        asked = problem(planner={"kind": "qp", "passes": passes})
+        planner = QpPlanner(asked)
+        ball = planner._frame.to_world(np.array([[9.0, 3.3, 0.2]]))[0]
+        planner.reset(ObstacleSet.from_shapes([Sphere(tuple(ball), 1.5)]), 1)
+        seen: list[Horizon] = []
+
+        class Watch:
+            name = "watch"
+
+            def rows(self, horizon: Horizon, seen: list[Horizon] = seen) -> LinearRows:
+                seen.append(horizon)
+                return TiltLimit(1.0).rows(horizon)
+
+        planner.constraints.append(Watch())
+        command = planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
+        assert command.plan is not None
+        assert len(seen) == passes
+        moved.append(np.abs(seen[-1].position - command.plan.states[..., 0:6:2]).max())
+    assert moved[1] < 0.5 * moved[0]
+
+
+def test_a_constraint_of_ones_own_is_kept() -> None:
+    class Ceiling:
+        name = "ceiling"
+
+        def rows(self, horizon: Horizon) -> LinearRows:
+            shape = (*horizon.shape, 1)
+            jac = np.zeros((*shape, 3))
+            jac[..., 2] = 1.0
+            price = np.full(shape, 1000.0)
+            return LinearRows("position", jac, None, np.full(shape, -2.0), price, price)
+
+    asked = problem()
+    planner = QpPlanner(asked, constraints=[*default_constraints(asked), Ceiling()])
+    planner.reset(ObstacleSet.empty(), 1)
+    command = planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
+    assert command.plan is not None
+    np.testing.assert_allclose(command.plan.states[..., -1, 4], -2.0, atol=0.02)
+
+
+def test_rows_that_do_not_fit_are_an_error_and_not_a_fall_back() -> None:
+    class Wrong:
+        name = "wrong"
+
+        def rows(self, horizon: Horizon) -> LinearRows:
+            return LinearRows("position", np.zeros((1, 1, 1, 1, 3)), np.zeros((1, 1, 1, 1)))
+
+    planner = QpPlanner(problem(), constraints=[Wrong()])
+    planner.reset(ObstacleSet.empty(), 1)
+    with pytest.raises(NapfError, match="constraint 'wrong': jac has shape"):
+        planner.step(nav(on_slots(planner)), 0.0)
+
+
+def test_a_walk_to_a_goal_is_not_flown() -> None:
+    with pytest.raises(ProblemError, match="formation"):
+        QpPlanner(load_problem("single_uav"))
+
+
+# -------------------------------------------------------------------------------- when something fails
+
+
+def test_without_navigation_a_uav_holds_where_it_was_and_the_others_fly_on() -> None:
+    planner = QpPlanner(problem())
+    planner.reset(ObstacleSet.empty(), 1)
+    good = nav(on_slots(planner), cruising(planner))
+    planner.step(good, 0.0)
+    lost = good.position.copy()
+    lost[0, 2] = np.nan
+    for tick in range(1, 4):
+        command = planner.step(replace(good, position=lost), 0.1 * tick)
+    np.testing.assert_array_equal(command.holding, [[False, False, True, False]])
+    np.testing.assert_array_equal(command.position[0, 2], good.position[0, 2])
+    np.testing.assert_array_equal(command.velocity[0, 2], 0.0)
+    assert command.reason is not None
+    np.testing.assert_array_equal(command.reason[0], [0, 0, Reason.NAVIGATION, 0])
+    assert planner.tally.counts["fall_back_hover"][0] == 3
+    assert {(e.uav, e.cause, e.action) for e in planner.ladder.events} == {(2, "navigation", Action.HOVER)}
+
+
+class Faulty:
+    """A solver that answers rubbish now and then: to some UAVs, or to nobody."""
+
+    KINDS = ("huge", "nan", "zeros", "old", "raises", "late")
+
+    def __init__(self, solver: BatchSolver, share: float, advance: Callable[[float], None]) -> None:
+        self.solver, self.share, self.advance = solver, share, advance
+        self.rng = np.random.default_rng(5)
+        self.spoilt = 0
+        self.old: BatchResult | None = None
+
+    def reset(self) -> None:
+        self.solver.reset()
+
+    def solve_batch(
+        self, horizon: HorizonQp, warm: WarmStart | None = None, active: np.ndarray | None = None
+    ) -> BatchResult:
+        kind = self.KINDS[self.rng.integers(len(self.KINDS))] if self.rng.random() < self.share else ""
+        good = self.solver.solve_batch(horizon, warm, active)
+        old, self.old = self.old, good
+        if not kind:
+            return good
+        self.spoilt += 1
+        if kind == "raises":
+            raise RuntimeError("the library has had enough")
+        if kind == "late":
+            self.advance(10.0)
+            return good
+        if kind == "old" and old is not None:
+            # Yesterday's answer with today's claim: only residuals on today's numbers can tell.
+            return replace(self.judged(horizon, old.z, old.y), messages={})
+        value = {"huge": 2.1e9, "nan": np.nan}.get(kind, 0.0)
+        return self.judged(horizon, np.full_like(good.z, value), np.zeros_like(good.y))
+
+    def judged(self, horizon: HorizonQp, z: np.ndarray, y: np.ndarray) -> BatchResult:
+        """What our own solver loop makes of a library that claims success with these numbers."""
+        from napf_mpc.qp import Layout
+        from napf_mpc.solvers.residuals import kkt_residuals
+
+        layout = Layout.of(horizon)
+        with np.errstate(all="ignore"):
+            primal, dual, product = kkt_residuals(layout.sparsity, layout.values(horizon), z, y)
+        solved = np.full(z.shape[:2], STATUSES.index("solved"), dtype=np.int8)
+        return BatchResult(
+            solved, layout.states(z), layout.inputs(z), layout.block_slacks(z), z, y, primal, dual, product,
+            np.zeros(z.shape[:2], dtype=np.int64),
+        )  # fmt: skip
+
+
+class Finite:
+    """Passes commands on and checks each of them."""
+
+    def __init__(self, planner: QpPlanner) -> None:
+        self.planner, self.name = planner, planner.name
+        vehicle = planner.problem.vehicle
+        self.inverse, self.most = mixer_inverse(vehicle), rotor_limit(vehicle)
+        self.hover = np.array([self.most * 4 / 2.2, 0.0, 0.0, 0.0])
+        self.steps = 0
+
+    @property
+    def tally(self) -> object:
+        return self.planner.tally
+
+    def reset(self, obstacles: ObstacleSet, runs: int) -> None:
+        self.planner.reset(obstacles, runs)
+
+    def step(self, solution: NavSolution, time_s: float) -> Command:
+        command = self.planner.step(solution, time_s)
+        assert command.plan is not None
+        for values in (command.position, command.velocity, command.direction, command.plan.states):
+            assert np.isfinite(values).all()
+        thrusts = np.einsum("ij,ruki->rukj", self.inverse.T, command.plan.inputs + self.hover)
+        assert (thrusts > -2e-3).all()
+        assert (thrusts < self.most + 2e-3).all()
+        self.steps += command.holding.size
+        return command
+
+
+def test_whatever_the_solver_returns_commands_are_sound_and_every_fall_back_is_counted() -> None:
+    now = itertools.count()
+    moment = [0.0]
+
+    def advance(seconds: float) -> None:
+        moment[0] += seconds
+
+    def clock() -> float:
+        next(now)
+        return moment[0]
+
+    flown = problem(
+        navigation={"filter": "kalman"}, mission={"length_m": 30.0}, simulation={"time_limit_s": 20.0}
+    )
+    faulty = Faulty(make_batch_solver("osqp"), 0.1, advance)
+    pilot = Finite(QpPlanner(flown, solver=faulty, clock=clock))
+    missions = simulate(flown, pilot, seed=103, runs=2)
+    counts = missions.tally.counts
+    assert faulty.spoilt > 10
+    # Every spoilt step refused the plans of all UAVs that flew, and each of these flew something else.
+    fallen = sum(counts[f"fall_back_{name}"].sum() for name in ("tail", "hover", "descend"))
+    assert counts["answers_refused"].sum() == fallen
+    assert fallen >= 4 * faulty.spoilt
+    causes = {event.cause for event in pilot.planner.ladder.events}
+    assert causes >= {"late", "status", "not_finite"}
+    assert not missions.score.obstacle_contact.any()
+    assert missions.score.finished.all()
+
+
+def test_late_answers_are_only_known_where_there_is_a_clock() -> None:
+    planner = QpPlanner(problem(), clock=iter([0.0, 10.0, 20.0, 20.01]).__next__)
+    planner.reset(ObstacleSet.empty(), 1)
+    solution = nav(on_slots(planner), cruising(planner))
+    assert planner.step(solution, 0.0).holding.all()
+    assert not planner.step(solution, 0.1).holding.any()
+    assert [event.cause for event in planner.ladder.events] == ["late"] * 4
