@@ -141,9 +141,9 @@ def main() -> None:
     seconds = time.perf_counter() - began
     words = ", ".join(f"{name} {version}" for name, version in versions().items())
     print(
-        f"\nN = {arguments.runs} runs a row, {arguments.block} seeds ({seed}), 95 % Wilson intervals; metrics "
-        f"are medians of the runs, in metres, seconds and N^2 s. {seconds:.0f} s with {arguments.workers} "
-        f"workers on {platform.machine()}; {words}."
+        f"\nN = {arguments.runs} runs a row, {arguments.block} seeds ({seed}), 95 % Wilson intervals, "
+        f"metrics are medians of the runs, in metres, seconds and N^2 s. {seconds:.0f} s with "
+        f"{arguments.workers} workers on {platform.machine()}; {words}."
     )
 
 
