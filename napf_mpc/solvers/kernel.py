@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from napf_mpc.qp import SIGNALS, Array, HorizonModel, HorizonQp, Layout, QpError, QpStatus
+from napf_mpc.qp import STATES, Array, HorizonModel, HorizonQp, Index, Layout, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult, Mask, WarmStart, checked_guess, why_unusable
-from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, WorkingSet
-from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, Room, solve_programs
-from napf_mpc.solvers.kernel_rows import WIDTH, RowTable, gather
-from napf_mpc.solvers.kernel_signals import FIRST, KINDS, SignalMaps, signal_maps
+from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, capacity
+from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, solve_programs
+from napf_mpc.solvers.kernel_rows import WIDTH, Block, RowTable, gather
+from napf_mpc.solvers.kernel_signals import FIRST, KINDS, TARGETS, SignalMaps, signal_maps
 
 CHUNK = 16
 """Programs whose rows are gathered together: few enough to stay in the cache."""
@@ -41,13 +41,14 @@ class _Home:
     model: HorizonModel
     layout: Layout
     maps: SignalMaps
-    places: tuple[Array, ...]
-    """Of each block: places in the signals of its kind's axes."""
-    starts: tuple[tuple[int, int, int, int], ...]
-    """Of each block: where its slacks, lower, upper and slack multipliers start."""
+    signals: Index
+    """(block, 4) places in the signals of each block's axes at the first stage."""
+    starts: Index
+    """(block, 4) where each block's slacks, lower, upper and slack multipliers start."""
     table: RowTable
-    work: WorkingSet
-    room: Room
+    column: Array
+    gram: Array
+    factor: Array
 
     @classmethod
     def of(cls, horizon: HorizonQp, maps: SignalMaps | None) -> _Home:
@@ -55,19 +56,21 @@ class _Home:
         maps = signal_maps(horizon.model) if maps is None else maps
         layout = Layout.of(horizon)
         n = layout.stages
-        places, starts, row, rows, groups = [], [], 12 * n, 0, 0
+        signals, starts, row, rows, groups = [], [], STATES * n, 0, 0
         for (signal, count, per_stage, low, high), slack in zip(layout.kinds, layout.slacks, strict=True):
             first = int(FIRST[KINDS.index(signal)])
-            axes = maps.place[np.minimum(first + np.arange(WIDTH), first + len(SIGNALS[signal]) - 1)]
-            places.append(axes * n)
+            signals.append(n * maps.place[np.minimum(first + np.arange(WIDTH), len(TARGETS) - 1)])
             copies = low + high if per_stage else 1
             upper = row + count * n if copies == 2 else row
             starts.append((slack.start, row, upper, row + copies * count * n))
             row += (copies * count + per_stage) * n
             rows, groups = rows + count * n, groups + per_stage * n
+        size = capacity(n, rows, groups)
         return cls(
-            horizon.model, layout, maps, tuple(places), tuple(starts),
-            RowTable.empty(CHUNK, rows, groups), WorkingSet.empty(13 * n, rows, groups), Room.empty(n, groups),
+            horizon.model, layout, maps,
+            np.array(signals, dtype=np.int64).reshape(-1, WIDTH), np.array(starts, dtype=np.int64).reshape(-1, 4),
+            RowTable.empty(CHUNK, rows, groups),
+            np.empty((size, len(TARGETS) * n)), np.empty((size, size)), np.empty((size, size)),
         )  # fmt: skip
 
 
@@ -128,51 +131,30 @@ class KernelSolver:
         home = self._fitting_home(horizon)
         layout, (runs, uavs, stages) = home.layout, horizon.shape
         batch, n, m = runs * uavs, layout.sparsity.variables, layout.sparsity.constraints
-        asked = np.ones(runs, dtype=bool) if active is None else np.asarray(active, dtype=bool)
-        if asked.shape != (runs,):
+        asked = None if active is None else np.asarray(active, dtype=bool)
+        if asked is not None and asked.shape != (runs,):
             raise QpError(f"active has shape {asked.shape}, must be ({runs},)")
         guesses = checked_guess(warm, (runs, uavs, n), (runs, uavs, m))
         z, y = np.zeros((batch, n)), np.zeros((batch, m))
-        residuals, ends = np.full((batch, 3), np.inf), np.full(batch, -1)
-        steps = np.full(batch, -1)
-        initial = _plain(horizon.initial, (batch, 12))
-        reference = _plain(horizon.reference, (batch, stages, 12))
-        guess = (z, y) if guesses is None else (_plain(guesses.z, (batch, n)), _plain(guesses.y, (batch, m)))
-        step_s = _plain(horizon.model.step_s, (stages,))
-        blocks = _arrays(horizon, batch)
-        todo = np.flatnonzero(np.repeat(asked, uavs))
+        residuals, ends, steps = np.full((batch, 3), np.inf), np.full(batch, -1), np.full(batch, -1)
+        initial = _plain(horizon.initial).reshape(batch, STATES)
+        reference = _plain(horizon.reference).reshape(batch, stages, STATES)
+        guess = (z, y)
+        if guesses is not None:
+            guess = (_plain(guesses.z).reshape(batch, n), _plain(guesses.y).reshape(batch, m))
+        step_s, blocks = _plain(horizon.model.step_s), _blocks(horizon)
+        todo = np.arange(batch) if asked is None else np.flatnonzero(np.repeat(asked, uavs))
         for first in range(0, len(todo), CHUNK):
             programs = todo[first : first + CHUNK]
-            table = home.table
-            table.rows[:], table.groups[:], table.usable[:] = 0, 0, True
-            for places, block, starts in zip(home.places, blocks, home.starts, strict=True):
-                gather(table, programs, places, step_s, *block, *starts, y)
+            if blocks:
+                gather(home.table, programs, home.signals, home.starts, step_s, blocks, y)
+            else:
+                home.table.size[:] = (0, 0, 1)
             solve_programs(
-                home.maps, table, programs, home.work, home.room, initial, reference,
+                home.maps, home.table, programs, home.column, home.gram, home.factor, initial, reference,
                 guesses is not None, *guess, self._limit, z, y, residuals, ends, steps,
             )  # fmt: skip
-        return self._result(horizon, layout, asked, z, y, residuals, ends, steps)
-
-    def _result(
-        self, horizon: HorizonQp, layout: Layout, asked: Mask,
-        z: Array, y: Array, residuals: Array, ends: Array, steps: Array,
-    ) -> BatchResult:  # fmt: skip
-        runs, uavs, _ = horizon.shape
-        messages = {}
-        if not asked.all():
-            skipped = ~np.repeat(asked, uavs)
-            z[skipped], y[skipped] = np.nan, np.nan
-        for i in np.flatnonzero(ends > OPTIMAL).tolist():
-            run, uav = divmod(i, uavs)
-            messages[run, uav] = (
-                why_unusable(layout, horizon, run, uav) if ends[i] == UNUSABLE else _MESSAGES[ends[i]]
-            )
-        z, y = z.reshape(runs, uavs, -1), y.reshape(runs, uavs, -1)
-        primal, dual, complementarity = residuals.T.reshape(3, runs, uavs)
-        return BatchResult(
-            _CODES[ends].reshape(runs, uavs), layout.states(z), layout.inputs(z), layout.block_slacks(z), z, y,
-            primal, dual, complementarity, steps.reshape(runs, uavs), messages,
-        )  # fmt: skip
+        return _result(horizon, layout, z, y, residuals, ends, steps)
 
     def _fitting_home(self, horizon: HorizonQp) -> _Home:
         home = self._home
@@ -185,32 +167,51 @@ class KernelSolver:
         return home
 
 
+def _result(
+    horizon: HorizonQp, layout: Layout, z: Array, y: Array, residuals: Array, ends: Index, steps: Index
+) -> BatchResult:
+    runs, uavs, _ = horizon.shape
+    messages = {}
+    if ends.any():
+        skipped = ends < 0
+        z[skipped], y[skipped] = np.nan, np.nan
+        for i in np.flatnonzero(ends > OPTIMAL).tolist():
+            run, uav = divmod(i, uavs)
+            messages[run, uav] = (
+                why_unusable(layout, horizon, run, uav) if ends[i] == UNUSABLE else _MESSAGES[ends[i]]
+            )
+    z, y = z.reshape(runs, uavs, -1), y.reshape(runs, uavs, -1)
+    primal, dual, complementarity = residuals.T.reshape(3, runs, uavs)
+    return BatchResult(
+        _CODES[ends].reshape(runs, uavs), layout.states(z), layout.inputs(z), layout.block_slacks(z),
+        z, y, primal, dual, complementarity, steps.reshape(runs, uavs), messages,
+    )  # fmt: skip
+
+
 _CODES = np.full(len(_STATUS) + 1, STATUSES.index(QpStatus.SKIPPED), dtype=np.int8)
 """Code of each end; the last is that of programs that were not asked, whose end is -1."""
 for _end, _status in _STATUS.items():
     _CODES[_end] = STATUSES.index(_status)
 
-_NONE = np.empty((0, 0, 0))
+_NONE = np.empty((0, 0, 0, 0))
 
 
-def _arrays(horizon: HorizonQp, batch: int) -> list[tuple[object, ...]]:
-    """Arrays of each block with (run, uav) as one axis, as :func:`gather` takes them."""
-    stages, out = horizon.shape[2], []
-    for block in horizon.rows:
-        m, dim = block.jac.shape[3:]
-        jac = _plain(block.jac, (batch, stages, m, dim))
-        bounds = [
-            _NONE if v is None else _plain(v, (batch, stages, m)) for v in (block.lower, block.upper)
-        ]
-        if block.w1 is None or block.w2 is None:
-            prices = [np.empty((batch, stages, 0))] * 2
-        else:
-            prices = [_plain(v, (batch, stages, block.slack_count)) for v in (block.w1, block.w2)]
-        out.append((jac, *bounds, *prices, block.lower is not None, block.upper is not None))
-    return out
+def _blocks(horizon: HorizonQp) -> tuple[Block, ...]:
+    """Arrays of each block as :func:`~napf_mpc.solvers.kernel_rows.gather` takes them."""
+    return tuple(
+        Block(
+            _plain(block.jac),
+            _NONE if block.lower is None else _plain(block.lower),
+            _NONE if block.upper is None else _plain(block.upper),
+            _NONE if block.w1 is None else _plain(block.w1),
+            _NONE if block.w2 is None else _plain(block.w2),
+        )
+        for block in horizon.rows
+    )
 
 
-def _plain(values: Array, shape: tuple[int, ...]) -> Array:
+def _plain(values: Array) -> Array:
     """Values as one writable block of memory, the only kind that is compiled for."""
-    flat = np.ascontiguousarray(values, dtype=np.float64).reshape(shape)
-    return flat if flat.flags.writeable else flat.copy()
+    return (
+        values if values.flags.carray and values.dtype == np.float64 else np.array(values, dtype=np.float64)
+    )

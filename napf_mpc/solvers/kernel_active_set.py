@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
 from napf_mpc.qp import Array, Index
-from napf_mpc.solvers.kernel_signals import SignalMaps
+from napf_mpc.solvers.kernel_rows import GROUP, HIGH, LOW, WIDTH
+from napf_mpc.solvers.kernel_signals import SignalMaps, Small
 
 OPTIMAL, INFEASIBLE, LIMIT = 0, 1, 2
 """How the method ends."""
@@ -30,18 +31,16 @@ DEPENDENT = 1e-11
 """A row of which less than this part is new to the working set depends on it."""
 TOUCH = 1e-11
 """A row violated by less than this part of its bound, or of one unit, is met."""
-WORKING, OPENED, FREE, STEPS = 0, 1, 2, 3
+WORKING, OPENED, FREE, STEPS, SUSPECTS = 0, 1, 2, 3, 4
 """Places of the counters of a :class:`WorkingSet`."""
 
 
 class Program(NamedTuple):
-    """Rows of one program, see :class:`~napf_mpc.solvers.kernel_rows.RowTable`."""
+    """Rows of one program of a :class:`~napf_mpc.solvers.kernel_rows.RowTable`."""
 
-    coef: Array
-    at: Index
-    low: Array
-    high: Array
-    group: Index
+    number: Array
+    place: Small
+    u: int
     count: int
 
 
@@ -85,22 +84,27 @@ class WorkingSet(NamedTuple):
     opened: Index
     """(groups,) groups with w1 > 0 that are open."""
     counter: Index
-    """(4,) members, opened groups, free slots, steps."""
+    """(5,) members, opened groups, free slots, steps, suspects."""
+    suspect: Index
+    """(rows,) rows that were violated when all rows were last looked at."""
 
-    @classmethod
-    def empty(cls, signals: int, rows: int, groups: int) -> WorkingSet:
-        """Room for programs of a size."""
-        # Each member is new to the inputs or to the slack of an open group.
-        capacity = min(2 * rows, 4 * (signals // 13) + groups) + 2
-        floats, places = np.float64, np.int64
-        return cls(
-            np.empty(capacity, places), np.empty(capacity, floats), np.empty(capacity, places),
-            np.empty(capacity, floats), np.empty(capacity, floats), np.empty(capacity, floats),
-            np.empty((capacity, signals), floats), np.empty((capacity, capacity), floats),
-            np.empty((capacity, capacity), floats), np.empty(capacity, places), np.empty(max(rows, 1), places),
-            *(np.empty(groups + 1, kind) for kind in (np.bool_, floats, floats, floats, floats, floats, places)),
-            np.zeros(4, places),
-        )  # fmt: skip
+
+def capacity(stages: int, rows: int, groups: int) -> int:
+    """Members at most: each is new to the inputs or to the slack of an open group."""
+    return min(2 * rows, 4 * stages + groups) + 2
+
+
+@compiled
+def working_set(column: Array, gram: Array, factor: Array, rows: int, groups: int) -> WorkingSet:
+    """Room for programs of a size; the large arrays are kept by the caller."""
+    n = len(gram)
+    return WorkingSet(
+        np.empty(n, np.int64), np.empty(n), np.empty(n, np.int64), np.empty(n), np.empty(n), np.empty(n),
+        column, gram, factor, np.empty(n, np.int64), np.empty(rows, np.int64),
+        np.empty(groups, np.bool_), np.empty(groups), np.empty(groups), np.empty(groups),
+        np.empty(groups), np.empty(groups), np.empty(groups, np.int64), np.zeros(5, np.int64),
+        np.empty(rows, np.int64),
+    )  # fmt: skip
 
 
 @compiled
@@ -124,19 +128,20 @@ def reset(work: WorkingSet, rows: int, groups: int) -> None:
 def row_value(program: Program, row: int, signals: Array) -> float:
     """Value of a row, of signals or of a member's column."""
     total = 0.0
-    for d in range(4):
-        total += program.coef[row, d] * signals[program.at[row, d]]
+    for d in range(WIDTH):
+        total += program.number[program.u, row, d] * signals[program.place[program.u, row, d]]
     return total
 
 
 @compiled
 def fill_column(program: Program, maps: SignalMaps, row: int, side: float, column: Array) -> None:
     """Write what a unit force along a row does to all signals."""
-    column[:] = 0.0
-    for d in range(4):
-        weight = side * program.coef[row, d]
+    for i in range(len(column)):
+        column[i] = 0.0
+    for d in range(WIDTH):
+        weight = side * program.number[program.u, row, d]
         if weight != 0.0:
-            signal = program.at[row, d]
+            signal = program.place[program.u, row, d]
             for i in range(maps.begin[signal], maps.end[signal]):
                 column[i] += weight * maps.kernel[signal, i]
 
@@ -184,16 +189,18 @@ def widen(work: WorkingSet, first: int, n: int, extra: Array) -> None:
 def factorise(program: Program, work: WorkingSet, first: int, n: int) -> int:
     """Factor anew from a member on; return the first member that depends on those before, or n."""
     for i in range(first, n):
-        a, mine = work.slot[i], program.group[work.row[i]]
+        a, mine = work.slot[i], program.place[program.u, work.row[i], GROUP]
         for j in range(i, n):
-            work.factor[i, j] = work.gram[a, work.slot[j]] + bond(work, mine, program.group[work.row[j]])
+            work.factor[i, j] = work.gram[a, work.slot[j]] + bond(
+                work, mine, program.place[program.u, work.row[j], GROUP]
+            )
     for k in range(first):
         for i in range(first, n):
             known = work.factor[k, i]
             for j in range(i, n):
                 work.factor[i, j] -= known * work.factor[k, j]
     for i in range(first, n):
-        a, mine = work.slot[i], program.group[work.row[i]]
+        a, mine = work.slot[i], program.place[program.u, work.row[i], GROUP]
         whole = work.gram[a, a] + bond(work, mine, mine)
         if not work.factor[i, i] > DEPENDENT * whole:
             return i
@@ -229,7 +236,7 @@ def release(program: Program, work: WorkingSet, j: int, count: int) -> None:
     work.free[work.counter[FREE]] = work.slot[j]
     work.counter[FREE] += 1
     work.member[row] -= 1 if side > 0.0 else 2
-    group = program.group[row]
+    group = program.place[program.u, row, GROUP]
     work.total[group] = 0.0
     work.slack[group] = -work.w1[group] / work.w2[group] if work.is_open[group] else 0.0
     for i in range(j, count - 1):
@@ -260,7 +267,7 @@ def open_group(program: Program, work: WorkingSet, group: int) -> None:
     n = work.counter[WORKING]
     first, root = n, np.sqrt(1.0 / work.w2[group])
     for j in range(n - 1, -1, -1):
-        inside = program.group[work.row[j]] == group
+        inside = program.place[program.u, work.row[j], GROUP] == group
         work.part[j] = root if inside else 0.0
         first = j if inside else first
     widen(work, first, n, work.part)
@@ -285,7 +292,7 @@ def close_group(program: Program, work: WorkingSet, place: int) -> bool:
     n = work.counter[WORKING]
     first = n
     for j in range(n - 1, -1, -1):
-        if program.group[work.row[j]] == group:
+        if program.place[program.u, work.row[j], GROUP] == group:
             first = j
     return bool(factorise(program, work, first, n) == n)
 
@@ -295,11 +302,11 @@ def sums(program: Program, work: WorkingSet) -> None:
     """Sum the multipliers of each group and set its slack."""
     n = work.counter[WORKING]
     for j in range(n):
-        work.total[program.group[work.row[j]]] = 0.0
+        work.total[program.place[program.u, work.row[j], GROUP]] = 0.0
     for j in range(n):
-        work.total[program.group[work.row[j]]] += work.mult[j]
+        work.total[program.place[program.u, work.row[j], GROUP]] += work.mult[j]
     for j in range(n):
-        group = program.group[work.row[j]]
+        group = program.place[program.u, work.row[j], GROUP]
         if work.is_open[group]:
             work.slack[group] = (work.total[group] - work.w1[group]) / work.w2[group]
 
@@ -307,7 +314,8 @@ def sums(program: Program, work: WorkingSet) -> None:
 @compiled
 def respond(work: WorkingSet, base: Array, signals: Array) -> None:
     """Signals under the working set's multipliers."""
-    signals[:] = base
+    for i in range(len(base)):
+        signals[i] = base[i]
     for j in range(work.counter[WORKING]):
         column, mult = work.column[work.slot[j]], work.mult[j]
         for i in range(len(signals)):
@@ -315,17 +323,37 @@ def respond(work: WorkingSet, base: Array, signals: Array) -> None:
 
 
 @compiled
-def most_violated(program: Program, work: WorkingSet, signals: Array) -> tuple[int, float, float]:
-    """Row (or -1 - place of an opened group) that is violated most, its side, and by how much; zero if none."""
-    found, where, most = 0, 1.0, 0.0
+def violation_of(program: Program, work: WorkingSet, row: int, signals: Array) -> tuple[float, float]:
+    """By how much a row is violated, less than zero if it is met, and on which side."""
+    value = row_value(program, row, signals)
+    under, over = program.number[program.u, row, LOW] - value, value - program.number[program.u, row, HIGH]
+    slack = work.slack[program.place[program.u, row, GROUP]]
+    return (under - slack, 1.0) if under >= over else (over - slack, -1.0)
+
+
+@compiled
+def find_suspects(program: Program, work: WorkingSet, signals: Array) -> None:
+    """Look at all rows and note those that are violated."""
+    count = 0
     for r in range(program.count):
-        value = row_value(program, r, signals)
-        slack = work.slack[program.group[r]]
-        under, over = program.low[r] - value - slack, value - program.high[r] - slack
-        if under > most and under > TOUCH * max(1.0, abs(program.low[r])) and not work.member[r] & 1:
-            found, where, most = r, 1.0, under
-        if over > most and over > TOUCH * max(1.0, abs(program.high[r])) and not work.member[r] & 2:
-            found, where, most = r, -1.0, over
+        violation, _ = violation_of(program, work, r, signals)
+        if violation > TOUCH:
+            work.suspect[count] = r
+            count += 1
+    work.counter[SUSPECTS] = count
+
+
+@compiled
+def most_violated(program: Program, work: WorkingSet, signals: Array) -> tuple[int, float, float]:
+    """Suspect (or -1 - place of an opened group) that is violated most, its side, and by how much, or zero."""
+    found, where, most = 0, 1.0, 0.0
+    for e in range(work.counter[SUSPECTS]):
+        r = work.suspect[e]
+        violation, side = violation_of(program, work, r, signals)
+        if violation > most:
+            bound = program.number[program.u, r, LOW] if side > 0.0 else program.number[program.u, r, HIGH]
+            if violation > TOUCH * max(1.0, abs(bound)) and not work.member[r] & (1 if side > 0.0 else 2):
+                found, where, most = r, side, violation
     for e in range(work.counter[OPENED]):
         below = -work.slack[work.opened[e]]
         if below > most and below > TOUCH:
@@ -359,17 +387,21 @@ def ascend(
     int
         :data:`OPTIMAL`, :data:`INFEASIBLE` or :data:`LIMIT`.
     """
+    work.counter[SUSPECTS] = 0
     while True:
         sums(program, work)
         respond(work, base, signals)
         found, side, violation = most_violated(program, work, signals)
+        if violation == 0.0:
+            find_suspects(program, work, signals)
+            found, side, violation = most_violated(program, work, signals)
         if violation == 0.0:
             return OPTIMAL
         is_row = found >= 0
         if is_row:
             enter(program, maps, work, found, side)
             work.member[found] += 1 if side > 0.0 else 2
-            group = program.group[found]
+            group = program.place[program.u, found, GROUP]
         else:
             group = work.opened[-1 - found]
         waiting = 1 if is_row else 0
@@ -380,7 +412,7 @@ def ascend(
             n = work.counter[WORKING]
             # How much of the new row is new.
             for j in range(n):
-                shared = bond(work, group, program.group[work.row[j]])
+                shared = bond(work, group, program.place[program.u, work.row[j], GROUP])
                 work.part[j] = work.gram[work.slot[n], work.slot[j]] + shared if is_row else shared
             whole = bond(work, group, group)
             if is_row:
@@ -395,15 +427,15 @@ def ascend(
             length = violation / fresh if independent else np.inf
             blocking, opening = -1, -1
             for j in range(n):
-                work.rate[program.group[work.row[j]]] = 0.0
+                work.rate[program.place[program.u, work.row[j], GROUP]] = 0.0
                 if work.step[j] > 0.0 and work.mult[j] < length * work.step[j]:
                     length, blocking = work.mult[j] / work.step[j], j
             if is_row:
                 work.rate[group] = 1.0
             for j in range(n):
-                work.rate[program.group[work.row[j]]] -= work.step[j]
+                work.rate[program.place[program.u, work.row[j], GROUP]] -= work.step[j]
             for j in range(n + waiting):
-                other = program.group[work.row[j]]
+                other = program.place[program.u, work.row[j], GROUP]
                 if not work.is_open[other] and work.rate[other] > 0.0:
                     room = max(0.0, work.w1[other] - work.total[other])
                     if room < length * work.rate[other]:
@@ -438,7 +470,7 @@ def ascend(
 @compiled
 def lower_bound(program: Program, row: int, side: float) -> float:
     """Bound of a row on the side where it stands, as that of ``side * row >= bound``."""
-    return program.low[row] if side > 0.0 else -program.high[row]
+    return program.number[program.u, row, LOW] if side > 0.0 else -program.number[program.u, row, HIGH]
 
 
 @compiled
@@ -461,7 +493,7 @@ def resume(program: Program, work: WorkingSet, base: Array) -> None:
             bad = factorise(program, work, bad, n)
         for j in range(n):
             row, side = work.row[j], work.side[j]
-            group = program.group[row]
+            group = program.place[program.u, row, GROUP]
             work.mult[j] = lower_bound(program, row, side) - side * row_value(program, row, base)
             if work.is_open[group]:
                 work.mult[j] += work.w1[group] / work.w2[group]
@@ -477,7 +509,7 @@ def resume(program: Program, work: WorkingSet, base: Array) -> None:
         if sound:
             sums(program, work)
             for j in range(n):
-                group = program.group[work.row[j]]
+                group = program.place[program.u, work.row[j], GROUP]
                 if not work.is_open[group] and work.total[group] > work.w1[group]:
                     mark_open(work, group)
                     sound = False

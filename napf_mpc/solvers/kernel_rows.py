@@ -5,68 +5,75 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
 from napf_mpc.qp import Array, Index
+from napf_mpc.solvers.kernel_signals import Small
 
 WIDTH = 4
 """Signals that a row may use: positions, velocities and attitudes leave the last one empty."""
+LOW, HIGH = WIDTH, WIDTH + 1
+"""Places of the bounds in a row's numbers, behind its coefficients."""
+GROUP, Y_LOW, Y_HIGH = WIDTH, WIDTH + 1, WIDTH + 2
+"""Places in a row's places, behind those of its signals."""
+W1, W2 = 0, 1
+"""Places of the prices over a stage."""
+SLACK_Z, SLACK_Y = 0, 1
+"""Where a slack and the multiplier of its sign go."""
+ROWS, GROUPS, USABLE = 0, 1, 2
+"""Places of a program's counts."""
 
 
 class RowTable(NamedTuple):
     """Rows ``low <= coef . signals[at] <= high`` of some programs, and the groups that share a slack."""
 
-    coef: Array
-    """(program, row, 4)."""
-    at: Index
-    """(program, row, 4) places in the signals."""
-    low: Array
-    """(program, row), -inf where there is none."""
-    high: Array
-    """(program, row)."""
-    group: Index
-    """(program, row) slack of the row; the last group of the table for hard rows."""
-    y_low: Index
-    """(program, row) where the multiplier of the lower bound goes."""
-    y_high: Index
-    """(program, row)."""
-    w1: Array
-    """(program, group) linear price over the stage; infinite for the group of hard rows."""
-    w2: Array
-    """(program, group) quadratic price."""
-    slack_z: Index
-    """(program, group) where the slack goes."""
-    slack_y: Index
-    """(program, group) where the multiplier of its sign goes."""
-    rows: Index
-    """(program,) rows in use."""
-    groups: Index
-    """(program,) groups in use, the hard one not counted."""
-    usable: NDArray[np.bool_]
-    """(program,) whether all numbers are sound."""
+    number: Array
+    """(program, row, 6) coefficients and bounds; a bound that is missing is infinite."""
+    place: Small
+    """(program, row, 7) signals, group, and where the multipliers of the bounds go; hard rows are in the last
+    group of the table."""
+    price: Array
+    """(program, group, 2) linear and quadratic price of each slack over its stage."""
+    put: Index
+    """(program, group, 2) where each slack and the multiplier of its sign go."""
+    size: Index
+    """(program, 3) rows and groups in use, and whether all numbers are sound."""
 
     @classmethod
     def empty(cls, programs: int, rows: int, groups: int) -> RowTable:
         """Room for a number of programs."""
-        row, group = (programs, max(rows, 1)), (programs, groups + 1)
-        floats, places = np.float64, np.int64
+        # One to spare: a row is written before it is known to have no finite bound.
+        rows += 1
         return cls(
-            np.empty((*row, WIDTH), floats), np.empty((*row, WIDTH), places),
-            np.empty(row, floats), np.empty(row, floats),
-            np.empty(row, places), np.empty(row, places), np.empty(row, places),
-            np.empty(group, floats), np.empty(group, floats), np.empty(group, places), np.empty(group, places),
-            np.empty(programs, places), np.empty(programs, places), np.empty(programs, np.bool_),
-        )  # fmt: skip
+            np.empty((programs, rows, HIGH + 1)),
+            np.empty((programs, rows, Y_HIGH + 1), dtype=np.uint32),
+            np.empty((programs, groups + 1, 2)),
+            np.empty((programs, groups + 1, 2), dtype=np.int64),
+            np.empty((programs, 3), dtype=np.int64),
+        )
+
+
+class Block(NamedTuple):
+    """Arrays of one block of rows, see :class:`~napf_mpc.constraints.constraint.LinearRows`."""
+
+    jac: Array
+    """(run, uav, N, m, dim)."""
+    lower: Array
+    """(run, uav, N, m), or without entries if there is none."""
+    upper: Array
+    """(run, uav, N, m), or without entries if there is none."""
+    w1: Array
+    """(run, uav, N, slacks a stage), or without entries for hard rows."""
+    w2: Array
+    """The same."""
 
 
 @compiled
 def gather(
-    table: RowTable, programs: Index, places: Index, step_s: Array,
-    jac: Array, lower: Array, upper: Array, w1: Array, w2: Array,
-    has_lower: bool, has_upper: bool, z_at: int, y_lower: int, y_upper: int, y_slack: int, y: Array,
+    table: RowTable, programs: Index, signals: Index, starts: Index, step_s: Array,
+    blocks: tuple[Block, ...], y: Array,
 ) -> None:  # fmt: skip
-    """Append one block's rows to the table, and fill in the multipliers of slacks that stay at zero.
+    """Write the finite rows of some programs, and the multipliers of slacks that stay at zero.
 
     Parameters
     ----------
@@ -74,59 +81,75 @@ def gather(
         Where the rows go.
     programs : array of int, shape (programs of the table,)
         Their places in the batch.
-    places : array of int, shape (4,)
-        Places in the signals of this kind's axes at the first stage.
+    signals : array of int, shape (block, 4)
+        Places in the signals of each block's axes at the first stage.
+    starts : array of int, shape (block, 4)
+        Where each block's slacks and lower, upper and slack multipliers start in the layout.
     step_s : array, shape (N,)
         Length of each stage [s].
-    jac, lower, upper : array, shapes (batch, N, m, dim) and (batch, N, m)
-        As in :class:`~napf_mpc.constraints.constraint.LinearRows`; a missing bound is an empty array.
-    w1, w2 : array, shape (batch, N, slacks a stage)
-        Prices; without slacks for hard rows.
-    has_lower, has_upper : bool
-        Which bounds there are.
-    z_at, y_lower, y_upper, y_slack : int
-        Where the block's slacks and multipliers start in the layout.
+    blocks : tuple of Block
+        Rows of all programs.
     y : array, shape (batch, multipliers)
         Multipliers of all rows.
     """
-    stages, count, dim = jac.shape[1], jac.shape[2], jac.shape[3]
-    per_stage = w1.shape[2]
-    hard = table.w1.shape[1] - 1
     for u in range(len(programs)):
-        i, row, group, sound = programs[u], table.rows[u], table.groups[u], True
-        for k in range(stages):
-            for s in range(per_stage):
-                linear, square = w1[i, k, s], w2[i, k, s]
-                # NaN fails every comparison.
-                sound = sound and 0.0 <= linear < np.inf and 0.0 <= square < np.inf
-                y[i, y_slack + k * per_stage + s] = -linear * step_s[k]
-            shared = -1
-            for j in range(count):
-                low = lower[i, k, j] if has_lower else -np.inf
-                high = upper[i, k, j] if has_upper else np.inf
-                sound = sound and low < np.inf and high > -np.inf and (per_stage > 0 or low <= high)
-                for d in range(dim):
-                    sound = sound and np.isfinite(jac[i, k, j, d])
-                if low == -np.inf and high == np.inf:
-                    continue
-                for d in range(WIDTH):
-                    table.coef[u, row, d] = jac[i, k, j, d] if d < dim else 0.0
-                    table.at[u, row, d] = places[d] + k if d < dim else 0
-                table.low[u, row], table.high[u, row] = low, high
-                table.y_low[u, row] = y_lower + k * count + j
-                table.y_high[u, row] = y_upper + k * count + j
-                if per_stage == 0:
-                    table.group[u, row] = hard
-                elif per_stage < count and shared >= 0:
-                    table.group[u, row] = shared
-                else:
-                    slack = k * per_stage + (j if per_stage == count else 0)
-                    price = (i, k, j if per_stage == count else 0)
-                    table.w1[u, group], table.w2[u, group] = w1[price] * step_s[k], w2[price] * step_s[k]
-                    table.slack_z[u, group], table.slack_y[u, group] = z_at + slack, y_slack + slack
-                    table.group[u, row] = group
-                    shared = group
-                    group += 1
-                row += 1
-        table.rows[u], table.groups[u] = row, group
-        table.usable[u] = table.usable[u] and sound
+        for e in range(2):
+            table.size[u, e] = 0
+        table.size[u, USABLE] = 1
+    for b in range(len(blocks)):
+        block = blocks[b]
+        for u in range(len(programs)):
+            gather_block(table, u, programs[u], signals, starts, b, step_s, block, y)
+
+
+@compiled
+def gather_block(
+    table: RowTable, u: int, i: int, signals: Index, starts: Index, b: int, step_s: Array,
+    block: Block, y: Array,
+) -> None:  # fmt: skip
+    """Append one block's rows of program i of the batch to place u of the table."""
+    stages, count, dim = block.jac.shape[2], block.jac.shape[3], block.jac.shape[4]
+    run, uav = i // block.jac.shape[1], i % block.jac.shape[1]
+    has_lower, has_upper, per_stage = block.lower.size > 0, block.upper.size > 0, block.w1.shape[3]
+    hard = table.price.shape[1] - 1
+    row, group, sound = table.size[u, ROWS], table.size[u, GROUPS], True
+    for k in range(stages):
+        for s in range(per_stage):
+            linear, square = block.w1[run, uav, k, s], block.w2[run, uav, k, s]
+            # NaN fails every comparison.
+            sound = sound and 0.0 <= linear < np.inf and 0.0 <= square < np.inf
+            y[i, starts[b, 3] + k * per_stage + s] = -linear * step_s[k]
+        shared = -1
+        for j in range(count):
+            low = block.lower[run, uav, k, j] if has_lower else -np.inf
+            high = block.upper[run, uav, k, j] if has_upper else np.inf
+            sound = sound and low < np.inf and high > -np.inf and (per_stage > 0 or low <= high)
+            for d in range(dim):
+                coefficient = block.jac[run, uav, k, j, d]
+                sound = sound and -np.inf < coefficient < np.inf
+                table.number[u, row, d] = coefficient
+                table.place[u, row, d] = signals[b, d] + k
+            if low == -np.inf and high == np.inf:
+                continue
+            for d in range(dim, WIDTH):
+                table.number[u, row, d], table.place[u, row, d] = 0.0, 0
+            table.number[u, row, LOW], table.number[u, row, HIGH] = low, high
+            table.place[u, row, Y_LOW] = starts[b, 1] + k * count + j
+            table.place[u, row, Y_HIGH] = starts[b, 2] + k * count + j
+            if per_stage == 0:
+                table.place[u, row, GROUP] = hard
+            elif per_stage < count and shared >= 0:
+                table.place[u, row, GROUP] = shared
+            else:
+                own = j if per_stage == count else 0
+                table.price[u, group, W1] = block.w1[run, uav, k, own] * step_s[k]
+                table.price[u, group, W2] = block.w2[run, uav, k, own] * step_s[k]
+                table.put[u, group, SLACK_Z] = starts[b, 0] + k * per_stage + own
+                table.put[u, group, SLACK_Y] = starts[b, 3] + k * per_stage + own
+                table.place[u, row, GROUP] = group
+                shared = group
+                group += 1
+            row += 1
+    table.size[u, ROWS], table.size[u, GROUPS] = row, group
+    if not sound:
+        table.size[u, USABLE] = 0

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse.csgraph import connected_components
 
@@ -26,39 +27,31 @@ TARGETS = np.array(
 """(13,) place of each signal in the state, or 12 and its place in the input."""
 FIRST = np.cumsum([0, *(len(SIGNALS[kind]) for kind in KINDS)])[:-1]
 """(4,) number of the first signal of each kind."""
+A, B, Q, R, CLOSED, GAIN, PULL, INVERSE, TO_GO = range(9)
+"""Matrices of a stage: the model's; A - B K, K, H^-1 B' and H^-1; the optimal cost from its end on."""
+NOISE = 1e-14
+"""Entries of a weight below this part of what its diagonal allows are rounding."""
 LOOSE = 1e-13
 """Signals correlated less than this belong to different chains: it is the rounding of the kernel."""
 FLAT = 1e-13
 """Least eigenvalue of a stage's scaled Hessian: below it the cost does not determine the inputs."""
 
 
-class SignalMaps(NamedTuple):
-    """A model as the compiled loops need it; ``_t`` marks a transpose, so that inner loops are contiguous."""
+Small = NDArray[np.uint32]
+"""Places that are never negative: the compiled loops need not ask."""
 
-    a: Array
-    """(N, 12, 12)."""
-    a_t: Array
-    """(N, 12, 12)."""
-    b: Array
-    """(N, 12, 4)."""
-    b_t: Array
-    """(N, 4, 12)."""
-    q: Array
-    """(N, 12, 12)."""
-    r: Array
-    """(N, 4, 4)."""
-    closed: Array
-    """(N, 12, 12) A - B K."""
-    gain: Array
-    """(N, 4, 12) K."""
-    gain_t: Array
-    """(N, 12, 4)."""
-    pull_t: Array
-    """(N, 12, 4) transpose of H^-1 B'."""
-    inverse: Array
-    """(N, 4, 4) H^-1."""
-    to_go: Array
-    """(N, 12, 12) weight of the state at the end of each stage in the optimal cost from there on."""
+
+class SignalMaps(NamedTuple):
+    """A model as the compiled loops need it: matrices as lists of their entries, and the signal kernel."""
+
+    begins: Index
+    """(9, N + 1) where the entries of each matrix and stage begin, see :data:`A` to :data:`TO_GO`."""
+    row: Small
+    """(entries,)."""
+    column: Small
+    """(entries,) not decreasing within a stage, so that sums do not wait for each other."""
+    value: Array
+    """(entries,)."""
     kernel: Array
     """(13 N, 13 N) signal kernel; signals chain by chain, stages of one signal in a row."""
     begin: Index
@@ -67,9 +60,9 @@ class SignalMaps(NamedTuple):
     """(13 N,) one past the last."""
     place: Index
     """(13,) each signal's place in the chain order: its stage k stands at ``place * N + k``."""
-    target: Index
+    target: Small
     """(13 N,) place of each signal in state and input, see :data:`TARGETS`."""
-    stage: Index
+    stage: Small
     """(13 N,) its stage."""
 
 
@@ -82,10 +75,11 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
         If the cost leaves an input undetermined: the method starts from the unconstrained optimum.
     """
     n = model.stages
+    t = (0, 2, 1)
     closed, gain = np.empty((n, STATES, STATES)), np.empty((n, INPUTS, STATES))
     inverse, root = np.empty((n, INPUTS, INPUTS)), np.empty((n, INPUTS, INPUTS))
     to_go = np.empty((n, STATES, STATES))
-    to_go[-1] = model.q[-1]
+    to_go[-1] = _cleaned(model.q[-1])
     for k in range(n - 1, -1, -1):
         a, b, weight = model.a[k], model.b[k], to_go[k]
         hessian = model.r[k] + b.T @ weight @ b
@@ -97,7 +91,7 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
         if k:
             # Joseph's form keeps the weight positive however long the horizon.
             before = closed[k].T @ weight @ closed[k] + gain[k].T @ model.r[k] @ gain[k]
-            to_go[k - 1] = model.q[k - 1] + 0.5 * (before + before.T)
+            to_go[k - 1] = _cleaned(model.q[k - 1] + 0.5 * (before + before.T))
     moved = _responses(model.b, closed, gain, root)
     flat = moved.reshape(len(TARGETS) * n, INPUTS * n)
     kernel = flat @ flat.T
@@ -106,19 +100,40 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
     place[order] = np.arange(len(TARGETS))
     at = (order[:, None] * n + np.arange(n)).ravel()
     chain_of = np.repeat(chain[order], n)
-    t = (0, 2, 1)
+    pull = inverse @ model.b.transpose(t)
+    matrices = (model.a, model.b, model.q, model.r, closed, gain, pull, inverse, to_go)
     return SignalMaps(
-        *(np.ascontiguousarray(v, dtype=float) for v in (
-            model.a, model.a.transpose(t), model.b, model.b.transpose(t), model.q, model.r,
-            closed, gain, gain.transpose(t), (inverse @ model.b.transpose(t)).transpose(t), inverse,
-            to_go, kernel[np.ix_(at, at)],
-        )),
+        *_entries(matrices),
+        np.ascontiguousarray(kernel[np.ix_(at, at)]),
         np.searchsorted(chain_of, chain_of, side="left").astype(np.int64),
         np.searchsorted(chain_of, chain_of, side="right").astype(np.int64),
         place,
-        np.repeat(TARGETS[order], n),
-        np.tile(np.arange(n), len(TARGETS)),
-    )  # fmt: skip
+        np.repeat(TARGETS[order], n).astype(np.uint32),
+        np.tile(np.arange(n), len(TARGETS)).astype(np.uint32),
+    )
+
+
+def _cleaned(weight: Array) -> Array:
+    """Weight without entries that are rounding, such as a Riccati solver leaves between the chains."""
+    size = np.sqrt(np.maximum(np.diag(weight), 0.0))
+    return np.where(np.abs(weight) <= NOISE * size[:, None] * size, 0.0, weight)
+
+
+def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Small, Small, Array]:
+    """Where each matrix and stage begins; row, column and value of all entries that are not zero."""
+    stages = len(matrices[0])
+    begins = np.empty((len(matrices), stages + 1), dtype=np.int64)
+    rows, columns, values, count = [], [], [], 0
+    for which, matrix in enumerate(matrices):
+        # Column by column: the transpose's entries in order.
+        stage, column, row = np.nonzero(matrix.transpose(0, 2, 1))
+        begins[which] = count + np.searchsorted(stage, np.arange(stages + 1))
+        rows.append(row)
+        columns.append(column)
+        values.append(matrix[stage, row, column])
+        count += len(stage)
+    row, column = (np.concatenate(v).astype(np.uint32) for v in (rows, columns))
+    return begins, row, column, np.concatenate(values)
 
 
 def _inverse_root(hessian: Array, stage: int) -> Array:
@@ -168,8 +183,29 @@ def _chains(kernel: Array, stages: int) -> tuple[Index, Index]:
 
 
 @compiled
+def add(
+    maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
+) -> None:
+    """Add ``sign matrix vector[at]`` of a matrix of stage k to ``out[to, first:]``.
+
+    Arrays come whole with indices: views of them are counted, which costs more than the sums.
+    """
+    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
+        out[to, first + maps.row[e]] += sign * maps.value[e] * vector[at, maps.column[e]]
+
+
+@compiled
+def add_turned(
+    maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
+) -> None:
+    """The same of the matrix's transpose."""
+    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
+        out[to, first + maps.column[e]] += sign * maps.value[e] * vector[at, maps.row[e]]
+
+
+@compiled
 def sweep(
-    maps: SignalMaps, start: Array, pull: Array, push: Array, pushed: bool,
+    maps: SignalMaps, starts: Array, at: int, pull: Array, push: Array, pushed: bool,
     feed: Array, cost: Array, states: Array, inputs: Array,
 ) -> None:  # fmt: skip
     """Optimal states and inputs for a linear cost ``pull . x + push . u`` beside the model's own.
@@ -178,8 +214,10 @@ def sweep(
     ----------
     maps : SignalMaps
         Model.
-    start : array, shape (12,)
-        State now.
+    starts : array, shape (batch, 12)
+        States now.
+    at : int
+        Which of them.
     pull, push : array, shapes (N, 12) and (N, 4)
         Linear cost of the state at the end of each stage and of its input.
     pushed : bool
@@ -192,37 +230,30 @@ def sweep(
         Where the answer goes.
     """
     n = len(feed)
-    cost[n - 1] = pull[n - 1]
+    for k in range(n):
+        for i in range(STATES):
+            cost[k, i], states[k, i] = pull[k, i], 0.0
+        for m in range(INPUTS):
+            feed[k, m], inputs[k, m] = 0.0, 0.0
     for k in range(n - 1, -1, -1):
-        feed[k] = 0.0
-        for j in range(STATES):
-            for m in range(INPUTS):
-                feed[k, m] -= maps.pull_t[k, j, m] * cost[k, j]
+        add(maps, PULL, k, -1.0, cost, k, feed, k, 0)
         if pushed:
-            for j in range(INPUTS):
-                for m in range(INPUTS):
-                    feed[k, m] -= maps.inverse[k, j, m] * push[k, j]
+            add(maps, INVERSE, k, -1.0, push, k, feed, k, 0)
         if k == 0:
             break
-        cost[k - 1] = pull[k - 1]
-        for j in range(STATES):
-            for i in range(STATES):
-                cost[k - 1, i] += maps.closed[k, j, i] * cost[k, j]
+        add_turned(maps, CLOSED, k, 1.0, cost, k, cost, k - 1, 0)
         if pushed:
-            for m in range(INPUTS):
-                for i in range(STATES):
-                    cost[k - 1, i] -= maps.gain[k, m, i] * push[k, m]
+            add_turned(maps, GAIN, k, -1.0, push, k, cost, k - 1, 0)
     for k in range(n):
-        inputs[k], states[k] = feed[k], 0.0
-        for j in range(STATES):
-            x = start[j] if k == 0 else states[k - 1, j]
-            for m in range(INPUTS):
-                inputs[k, m] -= maps.gain_t[k, j, m] * x
-            for i in range(STATES):
-                states[k, i] += maps.a_t[k, j, i] * x
         for m in range(INPUTS):
-            for i in range(STATES):
-                states[k, i] += maps.b_t[k, m, i] * inputs[k, m]
+            inputs[k, m] = feed[k, m]
+        if k == 0:
+            add(maps, GAIN, k, -1.0, starts, at, inputs, k, 0)
+            add(maps, A, k, 1.0, starts, at, states, k, 0)
+        else:
+            add(maps, GAIN, k, -1.0, states, k - 1, inputs, k, 0)
+            add(maps, A, k, 1.0, states, k - 1, states, k, 0)
+        add(maps, B, k, 1.0, inputs, k, states, k, 0)
 
 
 @compiled
@@ -235,8 +266,8 @@ def read_signals(maps: SignalMaps, states: Array, inputs: Array, signals: Array)
 
 @compiled
 def stationarity(
-    maps: SignalMaps, start: Array, states: Array, inputs: Array, cost: Array, linear: Array, force: Array,
-    costates: Array, work: Array, out: Array,
+    maps: SignalMaps, starts: Array, at: int, states: Array, inputs: Array, cost: Array, linear: Array,
+    force: Array, costates: Array, loads: Array, weighed: Array, carried: Array, out: Array,
 ) -> None:  # fmt: skip
     """Multipliers of the dynamics, and how well states and inputs balance model, cost and forces.
 
@@ -247,7 +278,11 @@ def stationarity(
     ----------
     maps : SignalMaps
         Model.
-    start, states, inputs : array, shapes (12,), (N, 12) and (N, 4)
+    starts : array, shape (batch, 12)
+        States now.
+    at : int
+        Which of them.
+    states, inputs : array, shapes (N, 12) and (N, 4)
         The plan.
     cost : array, shape (N, 12)
         From the sweep that made the plan.
@@ -257,57 +292,45 @@ def stationarity(
         Sum of the rows times their multipliers, by signal.
     costates : array, shape (N, 12)
         Where the multipliers of the dynamics go.
-    work : array, shape (3, N, 16)
+    loads, weighed, carried : array, shape (N, 16)
         Room to work in.
     out : array, shape (6,)
         Largest violation of the dynamics and its largest term, largest entry of the Lagrangian's gradient and
         its largest term, largest multiplier times violation of the dynamics and its largest term.
     """
     n = len(states)
-    loads, weighed, carried = work[0], work[1], work[2]
-    loads[:] = 0.0
+    for k in range(n):
+        for i in range(STATES + INPUTS):
+            loads[k, i], weighed[k, i], carried[k, i] = 0.0, 0.0, 0.0
+        for i in range(STATES):
+            costates[k, i] = -cost[k, i]
     for i in range(len(force)):
         loads[maps.stage[i], maps.target[i]] += force[i]
     for e in range(6):
         out[e] = 0.0
     for k in range(n - 1, -1, -1):
-        weighed[k], carried[k] = 0.0, 0.0
-        for i in range(STATES):
-            costates[k, i] = -cost[k, i]
-        for j in range(STATES):
-            x = states[k, j]
-            for i in range(STATES):
-                costates[k, i] -= maps.to_go[k, j, i] * x
-                weighed[k, i] += maps.q[k, j, i] * x
+        add(maps, TO_GO, k, -1.0, states, k, costates, k, 0)
+        add(maps, Q, k, 1.0, states, k, weighed, k, 0)
         if k + 1 < n:
-            for j in range(STATES):
-                for i in range(STATES):
-                    carried[k, i] += maps.a[k + 1, j, i] * costates[k + 1, j]
+            add_turned(maps, A, k + 1, 1.0, costates, k + 1, carried, k, 0)
+        add(maps, R, k, 1.0, inputs, k, weighed, k, STATES)
+        add_turned(maps, B, k, 1.0, costates, k, carried, k, STATES)
         for i in range(STATES):
             left = weighed[k, i] + linear[k, i] + costates[k, i] - carried[k, i] - loads[k, i]
             out[2] = max(out[2], abs(left))
-            out[3] = max(
-                out[3], abs(weighed[k, i]), abs(linear[k, i]), abs(costates[k, i]), abs(carried[k, i])
-            )
-        for j in range(INPUTS):
-            for m in range(INPUTS):
-                weighed[k, STATES + m] += maps.r[k, j, m] * inputs[k, j]
-        for j in range(STATES):
-            for m in range(INPUTS):
-                carried[k, STATES + m] += maps.b[k, j, m] * costates[k, j]
+            out[3] = max(out[3], abs(weighed[k, i]), abs(linear[k, i]), abs(costates[k, i]))
         for m in range(STATES, STATES + INPUTS):
             out[2] = max(out[2], abs(weighed[k, m] - carried[k, m] - loads[k, m]))
-            out[3] = max(out[3], abs(weighed[k, m]), abs(carried[k, m]), abs(loads[k, m]))
+            out[3] = max(out[3], abs(weighed[k, m]), abs(loads[k, m]))
     for k in range(n):
         # The other way round than in the sweep, and in place of what is no longer needed.
-        loads[k] = 0.0
-        for m in range(INPUTS):
-            for i in range(STATES):
-                loads[k, i] += maps.b_t[k, m, i] * inputs[k, m]
-        for j in range(STATES):
-            x = start[j] if k == 0 else states[k - 1, j]
-            for i in range(STATES):
-                loads[k, i] += maps.a_t[k, j, i] * x
+        for i in range(STATES):
+            loads[k, i] = 0.0
+        add(maps, B, k, 1.0, inputs, k, loads, k, 0)
+        if k == 0:
+            add(maps, A, k, 1.0, starts, at, loads, k, 0)
+        else:
+            add(maps, A, k, 1.0, states, k - 1, loads, k, 0)
         for i in range(STATES):
             gap = abs(states[k, i] - loads[k, i])
             out[0] = max(out[0], gap)
