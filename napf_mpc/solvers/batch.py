@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib import import_module
 from typing import Protocol
 
 import numpy as np
@@ -183,7 +184,7 @@ class PerUavSolver:
         asked = np.ones(runs, dtype=bool) if active is None else np.asarray(active, dtype=bool)
         if asked.shape != (runs,):
             raise QpError(f"active has shape {asked.shape}, must be ({runs},)")
-        guesses = _checked(warm, (runs, uavs, n), (runs, uavs, m))
+        guesses = checked_guess(warm, (runs, uavs, n), (runs, uavs, m))
         usable = values.usable() & _penalties_convex(horizon)
         status = np.full((runs, uavs), STATUSES.index(QpStatus.SKIPPED), dtype=np.int8)
         z, y = np.full((runs, uavs, n), np.nan), np.full((runs, uavs, m), np.nan)
@@ -221,7 +222,14 @@ class PerUavSolver:
         return self._layout
 
 
-def _checked(warm: WarmStart | None, z: tuple[int, ...], y: tuple[int, ...]) -> WarmStart | None:
+def checked_guess(warm: WarmStart | None, z: tuple[int, ...], y: tuple[int, ...]) -> WarmStart | None:
+    """Guesses as they are.
+
+    Raises
+    ------
+    QpError
+        If they do not have the shapes that z and y must have.
+    """
     if warm is not None and (warm.z.shape != z or warm.y.shape != y):
         raise QpError(f"warm start has shapes {warm.z.shape} and {warm.y.shape}, must be {z} and {y}")
     return warm
@@ -238,6 +246,29 @@ def _penalties_convex(horizon: HorizonQp) -> Mask:
     return convex
 
 
+def why_unusable(layout: Layout, horizon: HorizonQp, run: int, uav: int) -> str:
+    """Why a program is not shown to a solver, in words."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return _why(layout, layout.values(_alone(horizon, run, uav)).of(0, 0))
+
+
+def _alone(horizon: HorizonQp, run: int, uav: int) -> HorizonQp:
+    """Horizon of one UAV."""
+
+    def own(values: Array | None) -> Array | None:
+        return None if values is None else values[run : run + 1, uav : uav + 1]
+
+    rows = tuple(
+        replace(
+            b, jac=b.jac[run : run + 1, uav : uav + 1],
+            lower=own(b.lower), upper=own(b.upper), w1=own(b.w1), w2=own(b.w2),
+        )
+        for b in horizon.rows
+    )  # fmt: skip
+    initial, reference = (v[run : run + 1, uav : uav + 1] for v in (horizon.initial, horizon.reference))
+    return HorizonQp(horizon.model, initial, reference, rows)
+
+
 def _why(layout: Layout, values: Values) -> str:
     try:
         QuadraticProgram.of_values(layout.sparsity, values)
@@ -246,6 +277,8 @@ def _why(layout: Layout, values: Values) -> str:
     return "not shown to the solver: a slack has a negative penalty"
 
 
+_BATCH_SHIPPED = {"kernel": ("napf_mpc.solvers.kernel", "KernelSolver")}
+"""Name -> module, imported on use, and class."""
 _BATCH_FACTORIES: dict[str, Callable[..., BatchSolver]] = {}
 
 
@@ -257,14 +290,20 @@ def register_batch_solver(name: str, factory: Callable[..., BatchSolver]) -> Non
     SolverError
         If the name is taken.
     """
-    if name in _BATCH_FACTORIES or name in solver_names():
+    if name in batch_solver_names():
         raise SolverError(f"a solver named {name!r} exists already")
     _BATCH_FACTORIES[name] = factory
 
 
 def batch_solver_names() -> tuple[str, ...]:
     """Names that :func:`make_batch_solver` takes, installed or not."""
-    return (*solver_names(), *_BATCH_FACTORIES)
+    return (*solver_names(), *_BATCH_SHIPPED, *_BATCH_FACTORIES)
+
+
+def _shipped(name: str) -> Callable[..., BatchSolver]:
+    module, maker = _BATCH_SHIPPED[name]
+    factory: Callable[..., BatchSolver] = getattr(import_module(module), maker)
+    return factory
 
 
 def make_batch_solver(name: str, **settings: object) -> BatchSolver:
@@ -277,9 +316,10 @@ def make_batch_solver(name: str, **settings: object) -> BatchSolver:
     """
     if name not in batch_solver_names():
         raise SolverError(f"solver {name!r} is not known; choose from {', '.join(batch_solver_names())}")
-    if name in _BATCH_FACTORIES:
+    if name in _BATCH_SHIPPED or name in _BATCH_FACTORIES:
+        factory = _BATCH_FACTORIES[name] if name in _BATCH_FACTORIES else _shipped(name)
         try:
-            return _BATCH_FACTORIES[name](**settings)
+            return factory(**settings)
         except TypeError as error:
             raise SolverError(f"solver {name!r}: {error}") from error
     return PerUavSolver(backend_maker(name, **settings))

@@ -1,0 +1,217 @@
+"""The kernel solver: exact answers for the horizons of many UAVs, by a dual active set on the signal kernel.
+
+What the model determines is computed once for a model; a program costs two sweeps along its stages, a scan of
+its rows for each change of the working set, and a certificate. See :mod:`~napf_mpc.solvers.kernel_signals`
+and :mod:`~napf_mpc.solvers.kernel_active_set`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from napf_mpc.qp import STATES, Array, HorizonModel, HorizonQp, Index, Layout, QpError, QpStatus
+from napf_mpc.solvers.batch import STATUSES, BatchResult, Mask, WarmStart, checked_guess, why_unusable
+from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, capacity
+from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, solve_programs
+from napf_mpc.solvers.kernel_rows import WIDTH, Block, RowTable, gather
+from napf_mpc.solvers.kernel_signals import FIRST, KINDS, TARGETS, SignalMaps, signal_maps
+
+CHUNK = 16
+"""Programs whose rows are gathered together: few enough to stay in the cache."""
+_STATUS = {
+    OPTIMAL: QpStatus.SOLVED,
+    INFEASIBLE: QpStatus.PRIMAL_INFEASIBLE,
+    LIMIT: QpStatus.MAX_ITERATIONS,
+    ROUGH: QpStatus.INACCURATE,
+    UNUSABLE: QpStatus.FAILED,
+}
+_MESSAGES = {
+    INFEASIBLE: "hard rows contradict each other",
+    LIMIT: "the limit of steps is reached",
+    ROUGH: "a KKT residual is above 1e-9 of its largest term",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Home:
+    """What a model and its kinds of rows need, kept from step to step."""
+
+    model: HorizonModel
+    layout: Layout
+    maps: SignalMaps
+    signals: Index
+    """(block, 4) places in the signals of each block's axes at the first stage."""
+    starts: Index
+    """(block, 4) where each block's slacks, lower, upper and slack multipliers start."""
+    table: RowTable
+    column: Array
+    gram: Array
+    factor: Array
+
+    @classmethod
+    def of(cls, horizon: HorizonQp, maps: SignalMaps | None) -> _Home:
+        """Home of a horizon; the maps of its model if they are known."""
+        maps = signal_maps(horizon.model) if maps is None else maps
+        layout = Layout.of(horizon)
+        n = layout.stages
+        signals, starts, row, rows, groups = [], [], STATES * n, 0, 0
+        for (signal, count, per_stage, low, high), slack in zip(layout.kinds, layout.slacks, strict=True):
+            first = int(FIRST[KINDS.index(signal)])
+            signals.append(n * maps.place[np.minimum(first + np.arange(WIDTH), len(TARGETS) - 1)])
+            copies = low + high if per_stage else 1
+            upper = row + count * n if copies == 2 else row
+            starts.append((slack.start, row, upper, row + copies * count * n))
+            row += (copies * count + per_stage) * n
+            rows, groups = rows + count * n, groups + per_stage * n
+        size = capacity(n, rows, groups)
+        return cls(
+            horizon.model, layout, maps,
+            np.array(signals, dtype=np.int64).reshape(-1, WIDTH), np.array(starts, dtype=np.int64).reshape(-1, 4),
+            RowTable.empty(CHUNK, rows, groups),
+            np.empty((size, len(TARGETS) * n)), np.empty((size, size)), np.empty((size, size)),
+        )  # fmt: skip
+
+
+class KernelSolver:
+    """Batch solver of the exact structured method; every answer carries its own certificate.
+
+    A warm start takes the rows that push in the guess as its first working set, and nothing else: without a
+    guess a solve is cold whatever was solved before, and with one it depends on that UAV's guess alone. One
+    object belongs to one thread; the compiled loops hold no GIL, so that objects in several threads run side
+    by side.
+
+    Parameters
+    ----------
+    max_iter : int, optional
+        Changes of the working set at most, for one program.
+
+    Raises
+    ------
+    TypeError
+        If max_iter is not a whole number > 0.
+    """
+
+    def __init__(self, max_iter: int = 5000) -> None:
+        if not isinstance(max_iter, int) or max_iter < 1:
+            raise TypeError(f"max_iter = {max_iter!r}, must be a whole number > 0")
+        self._limit = max_iter
+        self._home: _Home | None = None
+
+    def reset(self) -> None:
+        """Nothing to forget: a solve depends on its numbers and its guess alone."""
+
+    def solve_batch(
+        self, horizon: HorizonQp, warm: WarmStart | None = None, active: Mask | None = None
+    ) -> BatchResult:
+        """Solve the programs of a horizon.
+
+        Parameters
+        ----------
+        horizon : HorizonQp
+            Programs of all (run, uav). Numbers that are not finite, crossed bounds and negative penalties
+            make their own program fail, with a message, and no other.
+        warm : WarmStart, optional
+            Guesses; cold without.
+        active : array of bool, shape (run,), optional
+            Runs to solve; the others are skipped, whatever they hold.
+
+        Returns
+        -------
+        BatchResult
+            Answers; iterations are changes of the working set.
+
+        Raises
+        ------
+        QpError
+            If shapes do not fit, the model is not sound, or its cost does not determine the inputs.
+        """
+        horizon.check_shapes()
+        home = self._fitting_home(horizon)
+        layout, (runs, uavs, stages) = home.layout, horizon.shape
+        batch, n, m = runs * uavs, layout.sparsity.variables, layout.sparsity.constraints
+        asked = None if active is None else np.asarray(active, dtype=bool)
+        if asked is not None and asked.shape != (runs,):
+            raise QpError(f"active has shape {asked.shape}, must be ({runs},)")
+        guesses = checked_guess(warm, (runs, uavs, n), (runs, uavs, m))
+        z, y = np.zeros((batch, n)), np.zeros((batch, m))
+        residuals, ends, steps = np.full((batch, 3), np.inf), np.full(batch, -1), np.full(batch, -1)
+        initial = _plain(horizon.initial).reshape(batch, STATES)
+        reference = _plain(horizon.reference).reshape(batch, stages, STATES)
+        guess = (z, y)
+        if guesses is not None:
+            guess = (_plain(guesses.z).reshape(batch, n), _plain(guesses.y).reshape(batch, m))
+        step_s, blocks = _plain(horizon.model.step_s), _blocks(horizon)
+        todo = np.arange(batch) if asked is None else np.flatnonzero(np.repeat(asked, uavs))
+        for first in range(0, len(todo), CHUNK):
+            programs = todo[first : first + CHUNK]
+            if blocks:
+                gather(home.table, programs, home.signals, home.starts, step_s, blocks, y)
+            else:
+                home.table.size[:] = (0, 0, 1)
+            solve_programs(
+                home.maps, home.table, programs, home.column, home.gram, home.factor, initial, reference,
+                guesses is not None, *guess, self._limit, z, y, residuals, ends, steps,
+            )  # fmt: skip
+        return _result(horizon, layout, z, y, residuals, ends, steps)
+
+    def _fitting_home(self, horizon: HorizonQp) -> _Home:
+        home = self._home
+        if home is None or home.model is not horizon.model:
+            horizon.model.check()
+            home = _Home.of(horizon, None)
+        elif not home.layout.same_rows(horizon):
+            home = _Home.of(horizon, home.maps)
+        self._home = home
+        return home
+
+
+def _result(
+    horizon: HorizonQp, layout: Layout, z: Array, y: Array, residuals: Array, ends: Index, steps: Index
+) -> BatchResult:
+    runs, uavs, _ = horizon.shape
+    messages = {}
+    if ends.any():
+        skipped = ends < 0
+        z[skipped], y[skipped] = np.nan, np.nan
+        for i in np.flatnonzero(ends > OPTIMAL).tolist():
+            run, uav = divmod(i, uavs)
+            messages[run, uav] = (
+                why_unusable(layout, horizon, run, uav) if ends[i] == UNUSABLE else _MESSAGES[ends[i]]
+            )
+    z, y = z.reshape(runs, uavs, -1), y.reshape(runs, uavs, -1)
+    primal, dual, complementarity = residuals.T.reshape(3, runs, uavs)
+    return BatchResult(
+        _CODES[ends].reshape(runs, uavs), layout.states(z), layout.inputs(z), layout.block_slacks(z),
+        z, y, primal, dual, complementarity, steps.reshape(runs, uavs), messages,
+    )  # fmt: skip
+
+
+_CODES = np.full(len(_STATUS) + 1, STATUSES.index(QpStatus.SKIPPED), dtype=np.int8)
+"""Code of each end; the last is that of programs that were not asked, whose end is -1."""
+for _end, _status in _STATUS.items():
+    _CODES[_end] = STATUSES.index(_status)
+
+_NONE = np.empty((0, 0, 0, 0))
+
+
+def _blocks(horizon: HorizonQp) -> tuple[Block, ...]:
+    """Arrays of each block as :func:`~napf_mpc.solvers.kernel_rows.gather` takes them."""
+    return tuple(
+        Block(
+            _plain(block.jac),
+            _NONE if block.lower is None else _plain(block.lower),
+            _NONE if block.upper is None else _plain(block.upper),
+            _NONE if block.w1 is None else _plain(block.w1),
+            _NONE if block.w2 is None else _plain(block.w2),
+        )
+        for block in horizon.rows
+    )
+
+
+def _plain(values: Array) -> Array:
+    """Values as one writable block of memory, the only kind that is compiled for."""
+    return (
+        values if values.flags.carray and values.dtype == np.float64 else np.array(values, dtype=np.float64, order="C")
+    )

@@ -1,0 +1,524 @@
+r"""Dual active set of Goldfarb and Idnani (1983) on the signal kernel, with slacks that never are variables.
+
+Start at the optimum without rows, add the most violated row, and move the multipliers of the working set so
+that its rows stay met, until the new row is met too (a full step) or a multiplier reaches zero (a partial
+one: its row is dropped). The Cholesky factor of the working set's Gram matrix is kept, not made anew.
+
+A group of rows with the slack s, priced ``w1 s + w2 s^2 / 2``, is *closed* while the sum of its multipliers
+is below w1: then s = 0. It is *open* beyond: then ``s = (sum - w1) / w2``, which adds ``1 / w2`` to the Gram
+entries among its rows. In the method's own terms, a closed group is the row ``s >= 0`` in the working set with
+the multiplier ``w1 - sum``; opening drops that row, closing adds it. A group with w1 <= 0 is always open.
+
+D. Goldfarb, A. Idnani, "A numerically stable dual method for solving strictly convex quadratic programs",
+Mathematical Programming 27 (1983).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.jit import compiled
+from napf_mpc.qp import Array, Index
+from napf_mpc.solvers.kernel_rows import GROUP, HIGH, LOW, WIDTH
+from napf_mpc.solvers.kernel_signals import SignalMaps, Small
+
+OPTIMAL, INFEASIBLE, LIMIT = 0, 1, 2
+"""How the method ends."""
+DEPENDENT = 1e-11
+"""A row of which less than this part is new to the working set depends on it."""
+TOUCH = 1e-11
+"""A row violated by less than this part of its bound, or of one unit, is met."""
+WORKING, OPENED, FREE, STEPS, SUSPECTS = 0, 1, 2, 3, 4
+"""Places of the counters of a :class:`WorkingSet`."""
+
+
+class Program(NamedTuple):
+    """Rows of one program of a :class:`~napf_mpc.solvers.kernel_rows.RowTable`."""
+
+    number: Array
+    place: Small
+    u: int
+    count: int
+
+
+class WorkingSet(NamedTuple):
+    """Working set of a program; room is shared by all programs that one thread solves."""
+
+    row: Index
+    """(capacity,) row of each member."""
+    side: Array
+    """(capacity,) 1.0 if it stands at its lower, -1.0 if at its upper bound."""
+    slot: Index
+    """(capacity,) where its column and its Gram entries are kept."""
+    mult: Array
+    """(capacity,) its multiplier."""
+    step: Array
+    """(capacity,) change of the multipliers for a unit of the new one, with the opposite sign."""
+    part: Array
+    """(capacity,) part of the new row that is not new, in the factor's own axes."""
+    column: Array
+    """(capacity, 13 N) by slot: what a unit of the multiplier does to the signals."""
+    gram: Array
+    """(capacity, capacity) by slots, without slacks."""
+    factor: Array
+    """(capacity, capacity) transpose of the Cholesky factor, slacks of open groups included."""
+    free: Index
+    """(capacity,) slots not in use."""
+    member: Index
+    """(rows,) 1 if the row stands at its lower bound, 2 if at its upper, 3 if at both."""
+    is_open: NDArray[np.bool_]
+    """(groups,)."""
+    slack: Array
+    """(groups,)."""
+    total: Array
+    """(groups,) sum of the multipliers."""
+    rate: Array
+    """(groups,) its change for a unit of the new multiplier."""
+    w1: Array
+    """(groups,)."""
+    w2: Array
+    """(groups,)."""
+    opened: Index
+    """(groups,) groups with w1 > 0 that are open."""
+    counter: Index
+    """(5,) members, opened groups, free slots, steps, suspects."""
+    suspect: Index
+    """(rows,) rows that were violated when all rows were last looked at."""
+
+
+def capacity(stages: int, rows: int, groups: int) -> int:
+    """Members at most: each is new to the inputs or to the slack of an open group."""
+    return min(2 * rows, 4 * stages + groups) + 2
+
+
+@compiled
+def working_set(column: Array, gram: Array, factor: Array, rows: int, groups: int) -> WorkingSet:
+    """Room for programs of a size; the large arrays are kept by the caller."""
+    n = len(gram)
+    return WorkingSet(
+        np.empty(n, np.int64), np.empty(n), np.empty(n, np.int64), np.empty(n), np.empty(n), np.empty(n),
+        column, gram, factor, np.empty(n, np.int64), np.empty(rows, np.int64),
+        np.empty(groups, np.bool_), np.empty(groups), np.empty(groups), np.empty(groups),
+        np.empty(groups), np.empty(groups), np.empty(groups, np.int64), np.zeros(5, np.int64),
+        np.empty(rows, np.int64),
+    )  # fmt: skip
+
+
+@compiled
+def reset(work: WorkingSet, rows: int, groups: int) -> None:
+    """Forget all members; prices w1 and w2 of the groups must be set."""
+    for j in range(len(work.free)):
+        work.free[j] = j
+    work.counter[WORKING], work.counter[OPENED] = 0, 0
+    work.counter[FREE] = len(work.free)
+    for r in range(rows):
+        work.member[r] = 0
+    for g in range(groups):
+        work.total[g] = 0.0
+        work.is_open[g] = work.w1[g] <= 0.0
+        work.slack[g] = -work.w1[g] / work.w2[g] if work.is_open[g] else 0.0
+    hard = len(work.w1) - 1
+    work.w1[hard], work.is_open[hard], work.slack[hard], work.total[hard] = np.inf, False, 0.0, 0.0
+
+
+@compiled
+def row_value(program: Program, row: int, signals: Array) -> float:
+    """Value of a row, of signals or of a member's column."""
+    total = 0.0
+    for d in range(WIDTH):
+        total += program.number[program.u, row, d] * signals[program.place[program.u, row, d]]
+    return total
+
+
+@compiled
+def fill_column(program: Program, maps: SignalMaps, row: int, side: float, column: Array) -> None:
+    """Write what a unit force along a row does to all signals."""
+    for i in range(len(column)):
+        column[i] = 0.0
+    for d in range(WIDTH):
+        weight = side * program.number[program.u, row, d]
+        if weight != 0.0:
+            signal = program.place[program.u, row, d]
+            for i in range(maps.begin[signal], maps.end[signal]):
+                column[i] += weight * maps.kernel[signal, i]
+
+
+@compiled
+def bond(work: WorkingSet, one: int, other: int) -> float:
+    """What two groups' slacks add to the Gram entry of their rows."""
+    return 1.0 / work.w2[one] if one == other and work.is_open[one] else 0.0
+
+
+@compiled
+def forward(work: WorkingSet, n: int, values: Array) -> None:
+    """Solve with the Cholesky factor, in place."""
+    for i in range(n):
+        values[i] /= work.factor[i, i]
+        known = values[i]
+        for j in range(i + 1, n):
+            values[j] -= work.factor[i, j] * known
+
+
+@compiled
+def backward(work: WorkingSet, n: int, values: Array) -> None:
+    """Solve with the transpose of the Cholesky factor, in place."""
+    for i in range(n - 1, -1, -1):
+        total = values[i]
+        for j in range(i + 1, n):
+            total -= work.factor[i, j] * values[j]
+        values[i] = total / work.factor[i, i]
+
+
+@compiled
+def widen(work: WorkingSet, first: int, n: int, extra: Array) -> None:
+    """Factor of the Gram matrix plus ``extra extra'``, which is zero before the first member; spoils extra."""
+    for k in range(first, n):
+        old = work.factor[k, k]
+        new = np.sqrt(old * old + extra[k] * extra[k])
+        c, s = new / old, extra[k] / old
+        work.factor[k, k] = new
+        for i in range(k + 1, n):
+            work.factor[k, i] = (work.factor[k, i] + s * extra[i]) / c
+            extra[i] = c * extra[i] - s * work.factor[k, i]
+
+
+@compiled
+def factorise(program: Program, work: WorkingSet, first: int, n: int) -> int:
+    """Factor anew from a member on; return the first member that depends on those before, or n."""
+    for i in range(first, n):
+        a, mine = work.slot[i], program.place[program.u, work.row[i], GROUP]
+        for j in range(i, n):
+            work.factor[i, j] = work.gram[a, work.slot[j]] + bond(
+                work, mine, program.place[program.u, work.row[j], GROUP]
+            )
+    for k in range(first):
+        for i in range(first, n):
+            known = work.factor[k, i]
+            for j in range(i, n):
+                work.factor[i, j] -= known * work.factor[k, j]
+    for i in range(first, n):
+        a, mine = work.slot[i], program.place[program.u, work.row[i], GROUP]
+        whole = work.gram[a, a] + bond(work, mine, mine)
+        if not work.factor[i, i] > DEPENDENT * whole:
+            return i
+        root = np.sqrt(work.factor[i, i])
+        for j in range(i, n):
+            work.factor[i, j] /= root
+        for k in range(i + 1, n):
+            known = work.factor[i, k]
+            for j in range(k, n):
+                work.factor[k, j] -= known * work.factor[i, j]
+    return n
+
+
+@compiled
+def enter(program: Program, maps: SignalMaps, work: WorkingSet, row: int, side: float) -> None:
+    """Write a row behind the last member, with its column and Gram entries, without making it one."""
+    n = work.counter[WORKING]
+    work.counter[FREE] -= 1
+    slot = work.free[work.counter[FREE]]
+    work.row[n], work.side[n], work.slot[n], work.mult[n] = row, side, slot, 0.0
+    column = work.column[slot]
+    fill_column(program, maps, row, side, column)
+    for j in range(n + 1):
+        entry = work.side[j] * row_value(program, work.row[j], column)
+        work.gram[slot, work.slot[j]] = entry
+        work.gram[work.slot[j], slot] = entry
+
+
+@compiled
+def release(program: Program, work: WorkingSet, j: int, count: int) -> None:
+    """Take member j out of a list of so many; the factor is not touched."""
+    row, side = work.row[j], work.side[j]
+    work.free[work.counter[FREE]] = work.slot[j]
+    work.counter[FREE] += 1
+    work.member[row] -= 1 if side > 0.0 else 2
+    group = program.place[program.u, row, GROUP]
+    work.total[group] = 0.0
+    work.slack[group] = -work.w1[group] / work.w2[group] if work.is_open[group] else 0.0
+    for i in range(j, count - 1):
+        work.row[i], work.side[i] = work.row[i + 1], work.side[i + 1]
+        work.slot[i], work.mult[i] = work.slot[i + 1], work.mult[i + 1]
+
+
+@compiled
+def drop(program: Program, work: WorkingSet, j: int, waiting: int) -> None:
+    """Take member j out of working set and factor; so many rows wait behind the last member."""
+    n = work.counter[WORKING]
+    for i in range(j + 1, n):
+        work.part[i - 1] = work.factor[j, i]
+    for k in range(j):
+        for i in range(j, n - 1):
+            work.factor[k, i] = work.factor[k, i + 1]
+    for k in range(j, n - 1):
+        for i in range(k, n - 1):
+            work.factor[k, i] = work.factor[k + 1, i + 1]
+    release(program, work, j, n + waiting)
+    work.counter[WORKING] = n - 1
+    widen(work, j, n - 1, work.part)
+
+
+@compiled
+def open_group(program: Program, work: WorkingSet, group: int) -> None:
+    """Let a group's slack go: its row ``s >= 0`` leaves the working set."""
+    n = work.counter[WORKING]
+    first, root = n, np.sqrt(1.0 / work.w2[group])
+    for j in range(n - 1, -1, -1):
+        inside = program.place[program.u, work.row[j], GROUP] == group
+        work.part[j] = root if inside else 0.0
+        first = j if inside else first
+    widen(work, first, n, work.part)
+    mark_open(work, group)
+
+
+@compiled
+def mark_open(work: WorkingSet, group: int) -> None:
+    """Note that a group is open; the factor is not touched."""
+    work.is_open[group] = True
+    work.opened[work.counter[OPENED]] = group
+    work.counter[OPENED] += 1
+
+
+@compiled
+def close_group(program: Program, work: WorkingSet, place: int) -> bool:
+    """Hold an opened group's slack at zero; return whether the members stay independent."""
+    group = work.opened[place]
+    work.counter[OPENED] -= 1
+    work.opened[place] = work.opened[work.counter[OPENED]]
+    work.is_open[group], work.slack[group] = False, 0.0
+    n = work.counter[WORKING]
+    first = n
+    for j in range(n - 1, -1, -1):
+        if program.place[program.u, work.row[j], GROUP] == group:
+            first = j
+    return bool(factorise(program, work, first, n) == n)
+
+
+@compiled
+def sums(program: Program, work: WorkingSet) -> None:
+    """Sum the multipliers of each group and set its slack."""
+    n = work.counter[WORKING]
+    for j in range(n):
+        work.total[program.place[program.u, work.row[j], GROUP]] = 0.0
+    for j in range(n):
+        work.total[program.place[program.u, work.row[j], GROUP]] += work.mult[j]
+    for j in range(n):
+        group = program.place[program.u, work.row[j], GROUP]
+        if work.is_open[group]:
+            work.slack[group] = (work.total[group] - work.w1[group]) / work.w2[group]
+
+
+@compiled
+def respond(work: WorkingSet, base: Array, signals: Array) -> None:
+    """Signals under the working set's multipliers."""
+    for i in range(len(base)):
+        signals[i] = base[i]
+    for j in range(work.counter[WORKING]):
+        column, mult = work.column[work.slot[j]], work.mult[j]
+        for i in range(len(signals)):
+            signals[i] += mult * column[i]
+
+
+@compiled
+def violation_of(program: Program, work: WorkingSet, row: int, signals: Array) -> tuple[float, float]:
+    """By how much a row is violated, less than zero if it is met, and on which side."""
+    value = row_value(program, row, signals)
+    under, over = program.number[program.u, row, LOW] - value, value - program.number[program.u, row, HIGH]
+    slack = work.slack[program.place[program.u, row, GROUP]]
+    return (under - slack, 1.0) if under >= over else (over - slack, -1.0)
+
+
+@compiled
+def find_suspects(program: Program, work: WorkingSet, signals: Array) -> None:
+    """Look at all rows and note those that are violated."""
+    count = 0
+    for r in range(program.count):
+        violation, _ = violation_of(program, work, r, signals)
+        if violation > TOUCH:
+            work.suspect[count] = r
+            count += 1
+    work.counter[SUSPECTS] = count
+
+
+@compiled
+def most_violated(program: Program, work: WorkingSet, signals: Array) -> tuple[int, float, float]:
+    """Suspect (or -1 - place of an opened group) that is violated most, its side, and by how much, or zero."""
+    found, where, most = 0, 1.0, 0.0
+    for e in range(work.counter[SUSPECTS]):
+        r = work.suspect[e]
+        violation, side = violation_of(program, work, r, signals)
+        if violation > most:
+            bound = program.number[program.u, r, LOW] if side > 0.0 else program.number[program.u, r, HIGH]
+            if violation > TOUCH * max(1.0, abs(bound)) and not work.member[r] & (1 if side > 0.0 else 2):
+                found, where, most = r, side, violation
+    for e in range(work.counter[OPENED]):
+        below = -work.slack[work.opened[e]]
+        if below > most and below > TOUCH:
+            found, where, most = -1 - e, 1.0, below
+    return found, where, most
+
+
+@compiled
+def ascend(
+    program: Program, maps: SignalMaps, work: WorkingSet, base: Array, signals: Array, limit: int
+) -> int:
+    """Go on from a working set whose multipliers are feasible to the optimum.
+
+    Parameters
+    ----------
+    program : Program
+        Rows.
+    maps : SignalMaps
+        Model.
+    work : WorkingSet
+        Members, their multipliers (>= 0, each closed group's sum at most w1) and factor.
+    base : array, shape (13 N,)
+        Signals of the optimum without rows.
+    signals : array, shape (13 N,)
+        Where the signals of the optimum go.
+    limit : int
+        Steps at most, counted in the working set.
+
+    Returns
+    -------
+    int
+        :data:`OPTIMAL`, :data:`INFEASIBLE` or :data:`LIMIT`.
+    """
+    work.counter[SUSPECTS] = 0
+    while True:
+        sums(program, work)
+        respond(work, base, signals)
+        found, side, violation = most_violated(program, work, signals)
+        if violation == 0.0:
+            find_suspects(program, work, signals)
+            found, side, violation = most_violated(program, work, signals)
+        if violation == 0.0:
+            return OPTIMAL
+        is_row = found >= 0
+        if is_row:
+            enter(program, maps, work, found, side)
+            work.member[found] += 1 if side > 0.0 else 2
+            group = program.place[program.u, found, GROUP]
+        else:
+            group = work.opened[-1 - found]
+        waiting = 1 if is_row else 0
+        while True:
+            if work.counter[STEPS] >= limit:
+                return LIMIT
+            work.counter[STEPS] += 1
+            n = work.counter[WORKING]
+            # How much of the new row is new.
+            for j in range(n):
+                shared = bond(work, group, program.place[program.u, work.row[j], GROUP])
+                work.part[j] = work.gram[work.slot[n], work.slot[j]] + shared if is_row else shared
+            whole = bond(work, group, group)
+            if is_row:
+                whole += work.gram[work.slot[n], work.slot[n]]
+            forward(work, n, work.part)
+            fresh = whole
+            for j in range(n):
+                fresh -= work.part[j] * work.part[j]
+                work.step[j] = work.part[j]
+            backward(work, n, work.step)
+            independent = fresh > DEPENDENT * whole
+            length = violation / fresh if independent else np.inf
+            blocking, opening = -1, -1
+            for j in range(n):
+                work.rate[program.place[program.u, work.row[j], GROUP]] = 0.0
+                if work.step[j] > 0.0 and work.mult[j] < length * work.step[j]:
+                    length, blocking = work.mult[j] / work.step[j], j
+            if is_row:
+                work.rate[group] = 1.0
+            for j in range(n):
+                work.rate[program.place[program.u, work.row[j], GROUP]] -= work.step[j]
+            for j in range(n + waiting):
+                other = program.place[program.u, work.row[j], GROUP]
+                if not work.is_open[other] and work.rate[other] > 0.0:
+                    room = max(0.0, work.w1[other] - work.total[other])
+                    if room < length * work.rate[other]:
+                        length, blocking, opening = room / work.rate[other], -1, other
+            if length == np.inf:
+                return INFEASIBLE
+            for j in range(n):
+                work.mult[j] -= length * work.step[j]
+            if is_row:
+                work.mult[n] += length
+            if independent:
+                violation -= length * fresh
+            if blocking >= 0:
+                drop(program, work, blocking, waiting)
+            elif opening >= 0:
+                open_group(program, work, opening)
+            else:
+                break
+            # Sums of the members and of the row that waits.
+            work.counter[WORKING] += waiting
+            sums(program, work)
+            work.counter[WORKING] -= waiting
+        if is_row:
+            work.factor[n, n] = np.sqrt(fresh)
+            for j in range(n):
+                work.factor[j, n] = work.part[j]
+            work.counter[WORKING] = n + 1
+        elif not close_group(program, work, -1 - found):
+            return LIMIT
+
+
+@compiled
+def lower_bound(program: Program, row: int, side: float) -> float:
+    """Bound of a row on the side where it stands, as that of ``side * row >= bound``."""
+    return program.number[program.u, row, LOW] if side > 0.0 else -program.number[program.u, row, HIGH]
+
+
+@compiled
+def resume(program: Program, work: WorkingSet, base: Array) -> None:
+    """Multipliers of a working set guessed, less what cannot be: dependent rows, multipliers below zero.
+
+    Members, columns, Gram entries and open groups must be set; the result is a state from which
+    :func:`ascend` goes on.
+    """
+    while True:
+        n = work.counter[WORKING]
+        bad = factorise(program, work, 0, n)
+        while bad < n:
+            for k in range(bad):
+                for i in range(bad, n - 1):
+                    work.factor[k, i] = work.factor[k, i + 1]
+            release(program, work, bad, n)
+            n -= 1
+            work.counter[WORKING] = n
+            bad = factorise(program, work, bad, n)
+        for j in range(n):
+            row, side = work.row[j], work.side[j]
+            group = program.place[program.u, row, GROUP]
+            work.mult[j] = lower_bound(program, row, side) - side * row_value(program, row, base)
+            if work.is_open[group]:
+                work.mult[j] += work.w1[group] / work.w2[group]
+        forward(work, n, work.mult)
+        backward(work, n, work.mult)
+        sound = True
+        for j in range(n - 1, -1, -1):
+            if not work.mult[j] > 0.0:
+                release(program, work, j, work.counter[WORKING])
+                work.counter[WORKING] -= 1
+                sound = False
+        n = work.counter[WORKING]
+        if sound:
+            sums(program, work)
+            for j in range(n):
+                group = program.place[program.u, work.row[j], GROUP]
+                if not work.is_open[group] and work.total[group] > work.w1[group]:
+                    mark_open(work, group)
+                    sound = False
+        work.counter[STEPS] += 1
+        if sound:
+            break
+    for e in range(work.counter[OPENED] - 1, -1, -1):
+        group = work.opened[e]
+        if work.total[group] == 0.0:
+            work.counter[OPENED] -= 1
+            work.opened[e] = work.opened[work.counter[OPENED]]
+            work.is_open[group], work.slack[group] = False, 0.0
