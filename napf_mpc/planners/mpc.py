@@ -23,6 +23,7 @@ from napf_mpc.planners.tally import COUNTED, FALL_BACKS, Tally
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem import Planner as Settings
 from napf_mpc.qp import STATES, HorizonQp
+from napf_mpc.safety_distance import rms_sigma
 from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
 from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
@@ -140,7 +141,7 @@ class QpPlanner:
         """Programs of this step, in coordinates whose origin is each UAV's reported position."""
         trusted = nav.trusted()
         state = self._state(nav, trusted)
-        reference = self._slots.over(state[..., POSITION], self._model.times_s)
+        reference = self._slots.over(state[..., POSITION], self._model.times_s, _sigma(nav, trusted))
         guess, _ = self._guess(state, reference, time_s)
         return self._programs(state, reference, self._horizon(guess, nav, trusted, time_s))
 
@@ -150,7 +151,9 @@ class QpPlanner:
         trusted = nav.trusted() & airborne
         self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
         state = self._state(nav, trusted)
-        reference = self._slots.over(state[..., POSITION], self._model.times_s, self._guide(nav, trusted))
+        reference = self._slots.over(
+            state[..., POSITION], self._model.times_s, _sigma(nav, trusted), self._guide(nav, trusted)
+        )
         began = 0.0 if self._clock is None else self._clock()
         answer = self._solve(state, reference, nav, trusted, time_s)
         late = self._clock is not None and not self._clock() - began <= self._period_s
@@ -323,6 +326,10 @@ class QpPlanner:
 def _reasons(action: Codes, trusted: Mask) -> Codes:
     waiting = action > Action.TAIL
     return np.where(waiting, np.where(trusted, Reason.SOLVER, Reason.NAVIGATION), Reason.NONE).astype(np.int8)
+
+
+def _sigma(nav: NavSolution, trusted: Mask) -> Array:
+    return rms_sigma(np.where(trusted[..., None, None], nav.position_covariance, 0.0))
 
 
 def _moved(states: Array, by: Array) -> Array:

@@ -17,6 +17,8 @@ POSITION, VELOCITY = slice(0, 6, 2), slice(1, 6, 2)
 
 LARGEST_PULL_M = 3.0
 """A slot farther than this counts as this far: the UAV comes back at its speed limit, without a lunge."""
+TRUSTED_M = 1.5
+"""Sigma at which half of a distance to the slot is believed [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +37,9 @@ class SlotReference:
         """References of a problem's formation."""
         return cls(PathFrame.of_mission(mission), formation_offsets(problem.formation), mission.speed_mps)
 
-    def over(self, position: Array, times_s: Array, guide: Guide | None = None) -> Array:
+    def over(
+        self, position: Array, times_s: Array, sigma_m: Array | float = 0.0, guide: Guide | None = None
+    ) -> Array:
         """States to track (run, uav, N, 12).
 
         The slots move at V_r from where the formation is now: its centre u_c is the mean of the reported
@@ -48,12 +52,17 @@ class SlotReference:
             As reported [m].
         times_s : array, shape (N,)
             From now [s].
+        sigma_m : array, shape (run, uav)
+            Reported standard deviation of the position [m]. A distance to the slot is believed, and so asked
+            for, by the part ``1 / (1 + (sigma / TRUSTED_M)^2)``: what is left is mostly navigation error,
+            and chasing it would move the truth off the slot.
         guide : Guide, optional
             Offsets from the lanes, and pace.
         """
         place = self.frame.to_path(position)
         ahead = synchronisation_error(place[..., 0], self.offsets[:, 0])
-        behind = np.clip(-ahead, -LARGEST_PULL_M, LARGEST_PULL_M)
+        belief = 1.0 / (1.0 + (np.asarray(sigma_m) / TRUSTED_M) ** 2)
+        behind = belief * np.clip(-ahead, -LARGEST_PULL_M, LARGEST_PULL_M)
         pace = np.ones(ahead.shape) if guide is None else guide.pace
         speed = np.repeat((self.speed_mps * pace)[..., None], len(times_s), axis=-1)
         along = behind[..., None] + speed * times_s
@@ -62,7 +71,7 @@ class SlotReference:
         here = np.zeros((*ahead.shape, 2)) if guide is None else guide.at(behind[..., None])[:, :, 0]
         away = self.offsets[:, 1:] + here - place[..., 1:]
         size = np.sqrt(away[..., 0] ** 2 + away[..., 1] ** 2)
-        pull = np.minimum(1.0, LARGEST_PULL_M / np.maximum(size, LARGEST_PULL_M))
+        pull = belief * LARGEST_PULL_M / np.maximum(size, LARGEST_PULL_M)
         across = (away * pull[..., None] - here)[:, :, None] + bend
         out = np.zeros((*along.shape, STATES))
         to_slot = np.concatenate([along[..., None], across], axis=-1)

@@ -213,5 +213,7 @@ def _blocks(horizon: HorizonQp) -> tuple[Block, ...]:
 def _plain(values: Array) -> Array:
     """Values as one writable block of memory, the only kind that is compiled for."""
     return (
-        values if values.flags.carray and values.dtype == np.float64 else np.array(values, dtype=np.float64, order="C")
+        values
+        if values.flags.carray and values.dtype == np.float64
+        else np.array(values, dtype=np.float64, order="C")
     )

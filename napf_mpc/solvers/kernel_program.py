@@ -28,7 +28,18 @@ from napf_mpc.solvers.kernel_active_set import (
     sums,
     working_set,
 )
-from napf_mpc.solvers.kernel_rows import GROUP, GROUPS, HIGH, LOW, ROWS, USABLE, WIDTH, Y_HIGH, Y_LOW, RowTable
+from napf_mpc.solvers.kernel_rows import (
+    GROUP,
+    GROUPS,
+    HIGH,
+    LOW,
+    ROWS,
+    USABLE,
+    WIDTH,
+    Y_HIGH,
+    Y_LOW,
+    RowTable,
+)
 from napf_mpc.solvers.kernel_signals import Q, SignalMaps, read_signals, stationarity, sweep
 
 ROUGH, UNUSABLE = 3, 4

@@ -62,20 +62,20 @@ def bend(pace: float = 1.0) -> Guide:
 
 def test_a_guide_bends_the_lane_and_the_velocity_with_it() -> None:
     reference = slots()
-    out = reference.over(places(reference, 30.0), TIMES, bend())
+    out = reference.over(places(reference, 30.0), TIMES, guide=bend())
     left = reference.frame.to_path(out[0, :, :, 0:6:2])[..., 1] - OFFSETS[:, None, 1]
     # 1, 2 and 8 m ahead.
     np.testing.assert_allclose(left, [[0.0, 0.0, 3.0], [0.0, 0.0, 0.0]], atol=1e-12)
-    halfway = reference.over(places(reference, 30.0), np.array([2.0]), bend())
+    halfway = reference.over(places(reference, 30.0), np.array([2.0]), guide=bend())
     np.testing.assert_allclose(halfway[0, 0, 0, 1:6:2], [2.0, 1.0, 0.0])
     np.testing.assert_allclose(halfway[0, 0, 0, 2], 20.0 + 2.0 + 1.0)
 
 
 def test_pace_slows_the_slot_and_zero_holds_it() -> None:
     reference = slots()
-    slow = reference.over(places(reference, 30.0), TIMES, bend(0.25))
+    slow = reference.over(places(reference, 30.0), TIMES, guide=bend(0.25))
     np.testing.assert_allclose(slow[0, :, :, 0] - 10.0 - 30.0 - OFFSETS[:, :1], [0.5 * TIMES] * 2)
-    held = reference.over(places(reference, 30.0), TIMES, bend(0.0))
+    held = reference.over(places(reference, 30.0), TIMES, guide=bend(0.0))
     assert not held[0, :, :, 1:6:2].any()
 
 

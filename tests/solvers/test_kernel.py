@@ -75,7 +75,9 @@ def mixed(
     rows = (
         LinearRows("position", normal, lower=near, w1=some(1), w2=some(1), shared_slack=True),
         LinearRows("position", normal, lower=near + 1.5, w1=0.0 * some(4), w2=some(4, 2.0)),
-        LinearRows("position", apart, lower=keep, upper=keep + 9.0, w1=some(2), w2=some(2), shared_slack=False),
+        LinearRows(
+            "position", apart, lower=keep, upper=keep + 9.0, w1=some(2), w2=some(2), shared_slack=False
+        ),
         LinearRows("velocity", speed, -fast, fast, some(5), some(5)),
         LinearRows("attitude", np.broadcast_to(np.eye(3)[:2], (*shape, 2, 3)), -lean, lean, some(2), some(2)),
         LinearRows(
@@ -103,6 +105,8 @@ def relative_residuals(horizon: HorizonQp, result: BatchResult) -> Array:
         primal = max(1.0, np.abs(program.a.multiply(z[None]).toarray()).max(), np.abs(finite).max())
         terms = (program.p.multiply(z[None]), program.a.multiply(y[:, None]))
         dual = max(1.0, np.abs(program.q).max(), *(float(abs(t).max()) for t in terms))
-        product = max(1.0, float((np.abs(y) * np.maximum(value, np.maximum(abs(finite), abs(finite_up)))).max()))
+        product = max(
+            1.0, float((np.abs(y) * np.maximum(value, np.maximum(abs(finite), abs(finite_up)))).max())
+        )
         out[run, uav] = max(got.primal / primal, got.dual / dual, got.complementarity / product)
     return out
