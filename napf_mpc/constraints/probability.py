@@ -135,7 +135,7 @@ def mission_share(
     wall at k sigma. It diffuses with sigma^2 / tau, and so leaves a ball within R^2 tau / (3 sigma^2) (the
     ball's content over the rate at which diffusion finds it), a disc within about R^2 tau / (2 sigma^2); both
     rates add up. Nor is the chance of a mission ever more than the sum over its fixes. The first is a rule of
-    thumb: measured, a mission achieves 0.3 to 1.1 of what is asked (``benchmarks/calibration.py``).
+    thumb: measured, a mission achieves from a quarter to all of what is asked (docs/risk_budget.md).
 
     Parameters
     ----------
