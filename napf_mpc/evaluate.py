@@ -110,7 +110,7 @@ class MissionScore:
         self._start = self._frame.along_track(scenario.initial_state[..., POSITION])
         self._end = self._start.copy()
         self._sums = np.zeros((runs, 9))
-        self._k = Inflation.of_planner(problem.planner).k
+        self._k = Inflation.of_problem(problem).k
         self._below_since = np.full(runs, np.nan)
         self._passed_at = np.full(runs, np.nan)
         self._reform_time = np.full(runs, np.nan)

@@ -15,8 +15,8 @@ _PATH = re.compile(r"[A-Za-z0-9_-]+(?:\.[A-Za-z0-9_-]+|\[[0-9]{1,9}\])*")
 _STEP = re.compile(r"([A-Za-z0-9_-]+)|\[([0-9]+)\]")
 _MAX_PATH = 200
 _FORM = "must be key.path=value, for example planner.k=2 or world.obstacles[0].radius_m=1.5"
-# Settings of which a problem holds only one: to set one takes the other out.
-_RIVALS = {("planner", "k"): "confidence", ("planner", "confidence"): "k"}
+# Settings of which a problem holds only one: to set one takes the others out.
+_RIVALS = (("planner", ("k", "confidence", "risk_per_mission")),)
 
 
 def parse_value(text: str) -> Any:
@@ -83,10 +83,12 @@ def apply_overrides(
         if fault:
             faults.append(f'setting "{shown_text(name, 80)}": {fault}')
     given = {path for _, path in paths}
-    for path, rival in _RIVALS.items():
-        table = data.get(path[0])
-        if path in given and (path[0], rival) not in given and isinstance(table, dict):
-            table.pop(rival, None)
+    for section, rivals in _RIVALS:
+        table = data.get(section)
+        if isinstance(table, dict) and any((section, name) in given for name in rivals):
+            for name in rivals:
+                if (section, name) not in given:
+                    table.pop(name, None)
     return data, faults
 
 

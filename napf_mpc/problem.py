@@ -632,6 +632,12 @@ class Planner(_Section):
     """Inflation in reported sigmas; 3 unless ``confidence`` is given."""
     confidence: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     """Two-sided probability from which k follows: k = sqrt(2) erfinv(confidence)."""
+    risk_per_mission: Annotated[float, Field(ge=1e-9, le=0.5)] | None = None
+    """Chance that any UAV touches an obstacle in a mission, from which k follows (docs/risk_budget.md)."""
+    active_time_s: float = Field(15.0, ge=0.1, le=3600.0)
+    """With ``risk_per_mission``: time for which each UAV has an obstacle at its margin, in all."""
+    risk_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
+    """With ``risk_per_mission``: correlation time of the position's error; by default navigation's own."""
     inflation: Literal["shift", "range"] = "shift"
     """k sigma shifts the distance to the obstacle, or only widens the range of influence."""
     sigma: Literal["directional", "largest", "rms", "chi2"] = "directional"
@@ -641,6 +647,9 @@ class Planner(_Section):
     def _one_confidence(self) -> Planner:
         if self.k is not None and self.confidence is not None:
             raise ValueError("exactly one of k and confidence may be given, not both")
+        if self.risk_per_mission is not None and not (self.k is None and self.confidence is None):
+            rival = "confidence" if self.k is None else "k"
+            raise ValueError(f"exactly one of {rival} and risk_per_mission may be given, not both")
         if self.sigma == "chi2" and self.confidence is None:
             raise ValueError('sigma = "chi2" needs confidence (k follows from it)')
         if self.confidence is not None and self.confidence > 1.0 - 1e-12:

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from napf_mpc.problem import Planner
+from napf_mpc.problem import Planner, Problem
+from napf_mpc.risk_budget import RiskBudget
 
 Array = NDArray[np.float64]
 SigmaReading = Literal["directional", "largest", "rms", "chi2"]
@@ -126,6 +127,8 @@ class Inflation:
     """Shift the distance (the obstacle grows), or only widen the range of influence rho_0."""
     reading: SigmaReading = "directional"
     """Which sigma."""
+    budget: RiskBudget | None = None
+    """What k is to be good for over a whole mission; None if it speaks of one moment."""
 
     def __post_init__(self) -> None:
         # A factor of NaN would make every comparison with rho_0 False: "no obstacle".
@@ -139,8 +142,25 @@ class Inflation:
                 raise ValueError(f"{name} = {value!r} must be one of {', '.join(choices)}")
 
     @classmethod
+    def of_problem(cls, problem: Problem) -> Inflation:
+        """Inflation as a problem asks for it: by k, by a confidence, or by a risk per mission."""
+        planner = problem.planner
+        if planner.risk_per_mission is not None:
+            budget = RiskBudget.of_problem(problem)
+            return cls(budget.k, planner.inflation, planner.sigma, budget)
+        return cls.of_planner(planner)
+
+    @classmethod
     def of_planner(cls, planner: Planner) -> Inflation:
-        """Inflation as a problem's planner section asks for it."""
+        """Inflation as a planner section asks for it by k or by a confidence.
+
+        Raises
+        ------
+        ValueError
+            If it asks for a risk per mission, which depends on the whole problem.
+        """
+        if planner.risk_per_mission is not None:
+            raise ValueError("planner.risk_per_mission needs the whole problem: use Inflation.of_problem")
         if planner.confidence is not None:
             k = confidence_factor(planner.confidence, 3 if planner.sigma == "chi2" else 1)
         else:

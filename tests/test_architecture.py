@@ -31,6 +31,7 @@ FLOORS: list[set[str]] = [
     {"quadratic_program", "constraints"},
     {"apf"},
     {"safety_distance"},
+    {"risk_budget"},
     {"navigation"},
     {"world"},
     {"vehicle"},
@@ -39,7 +40,7 @@ FLOORS: list[set[str]] = [
     {"problem_faults"},
     {"problem"},
     {"store", "data_folder", "overrides"},
-    {"risk", "shipped", "interrupts", "streams", "jit", "errors", "words"},
+    {"risk", "first_passage", "shipped", "interrupts", "streams", "jit", "errors", "words"},
 ]
 
 HOMES = {

@@ -84,7 +84,7 @@ class Gaps:
         distance = near.distance.reshape(shape) - radius
         normal, index = near.gradient.reshape(*shape, 3), near.index.reshape(shape)
         if margin == "exact":
-            size = _exact(horizon, index, normal, inflation.k)
+            size = _exact(horizon, index, normal, inflation)
         else:
             size = inflation.margin(horizon.covariance, normal)
         shifted, influence = inflation.apply(distance, size, rho_0)
@@ -110,7 +110,7 @@ class Gaps:
         return self.normal, along + (distance - self.shifted)
 
 
-def _exact(horizon: Horizon, index: NDArray[np.int64], normal: Array, k: float) -> Array:
+def _exact(horizon: Horizon, index: NDArray[np.int64], normal: Array, inflation: Inflation) -> Array:
     """Margins (run, uav, N, m) against the spheres and cylinders that are there."""
     world = horizon.obstacles
     if len(world) == 0:
@@ -128,10 +128,19 @@ def _exact(horizon: Horizon, index: NDArray[np.int64], normal: Array, k: float) 
         (shape[..., A] + horizon.problem.vehicle.radius_m).reshape(points, m),
         np.ascontiguousarray(normal).reshape(points, m, 3),
         np.ascontiguousarray(horizon.covariance).reshape(points, 3, 3),
-        k,
+        inflation.k,
         margin.reshape(points, m),
+        *_mission(inflation),
     )
     return margin
+
+
+def _mission(inflation: Inflation) -> tuple[float, float, float, float]:
+    """Risk, active time, correlation time and period of the budget that k comes from; no risk without."""
+    budget = inflation.budget
+    if budget is None:
+        return 0.0, 0.0, 0.0, 1.0
+    return budget.risk_per_uav, budget.active_s, budget.correlation_time_s, budget.period_s
 
 
 @dataclass(frozen=True)
@@ -143,9 +152,10 @@ class _Shell:
     reach_m: float = 10.0
     """Obstacles with a shifted distance of this or more are left out [m]."""
     margin: Margin = "half_space"
-    """``half_space`` is exact for a wall and careful elsewhere; ``exact`` asks for the same chance of a hit,
-    at each time and obstacle, of the sphere or cylinder itself. Small obstacles then take less room, and use
-    up the whole of what is asked: bound the mission's risk with it, not the step's."""
+    """``half_space`` is exact for a wall and careful elsewhere; ``exact`` asks for the same chance of a hit
+    of the sphere or cylinder itself: at each time and obstacle, or, with ``planner.risk_per_mission``, in a
+    mission. Small obstacles then take less room, and use up the whole of what is asked: bound the mission's
+    risk with it, not the step's."""
 
     def __post_init__(self) -> None:
         if self.obstacles < 1 or not self.reach_m > 0.0:
@@ -157,7 +167,7 @@ class _Shell:
 
     def gaps(self, horizon: Horizon, least_reach_m: float = 0.0) -> Gaps:
         """Nearest obstacles of each stage."""
-        inflation = self.inflation or Inflation.of_planner(horizon.problem.planner)
+        inflation = self.inflation or Inflation.of_problem(horizon.problem)
         if self.margin == "exact" and inflation.reading not in ("directional", "chi2"):
             raise ConstraintError(
                 f'margin = "exact" uses the whole covariance; inflation.reading = "{inflation.reading}" '

@@ -140,7 +140,7 @@ class NeighbourSeparation:
     def rows(self, horizon: Horizon) -> LinearRows:
         """Rows on the position, one for each of the nearest neighbours of each stage [m]."""
         runs, uavs, stages = horizon.shape
-        inflation = self.inflation or Inflation.of_planner(horizon.problem.planner)
+        inflation = self.inflation or Inflation.of_problem(horizon.problem)
         distance_m = _distance(self.distance_m, horizon.problem)
         # Axes (run, stage, uav, neighbour): a plan against all others at the same stage.
         position = horizon.position.transpose(0, 2, 1, 3)
@@ -230,7 +230,7 @@ def margin_attainable(
     normal, reach = tangent(offset, _distance(distance_m, problem), stretch, _aside(uavs, frame))
     relative = relative_covariance(covariance, common_factor)
     margin = _margin(
-        inflation or Inflation.of_planner(problem.planner),
+        inflation or Inflation.of_problem(problem),
         relative,
         np.broadcast_to(normal, relative.shape[:-1]),
     )

@@ -145,4 +145,4 @@ class NapfPlanner(PotentialFieldPlanner):
     """The paper's NAPF: the safety distance follows the reported navigation variance (section 3.2)."""
 
     def __init__(self, problem: Problem) -> None:
-        super().__init__(problem, Inflation.of_planner(problem.planner), "napf")
+        super().__init__(problem, Inflation.of_problem(problem), "napf")

@@ -130,7 +130,7 @@ class _Film:
     def __init__(self, problem: Problem, flown: Track, obstacles: ObstacleSet) -> None:
         self._flown = flown
         self._inflation = inflation_of(problem, flown.planner)
-        self._k = Inflation.of_planner(problem.planner).k or 3.0
+        self._k = Inflation.of_problem(problem).k or 3.0
         self._shapes = obstacles.shapes() if len(obstacles) else []
         self._frame = PathFrame.of_mission(formation_mission(problem))
         self._level = abs(self._frame.heading_rad) < 1e-9

@@ -261,7 +261,7 @@ def uncertainty_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -
     circle passes over or under it.
     """
     inflation = inflation_of(problem, flown.planner)
-    k = Inflation.of_planner(problem.planner).k or _SHOWN_K
+    k = Inflation.of_problem(problem).k or _SHOWN_K
     shown = _closest_uavs(flown, obstacles)
     picks = _every(flown.time_s, ELLIPSE_EVERY_S)
     centre, swell = flown.estimate[picks][:, shown], k * flown.sigma[picks][:, shown]

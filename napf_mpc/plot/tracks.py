@@ -105,7 +105,7 @@ def first_run(trajectories: Mapping[str, NDArray[Any]]) -> int:
 
 def inflation_of(problem: Problem, planner: str) -> Inflation:
     """How a planner inflates obstacles; the original APF does not."""
-    return Inflation(0.0) if planner == "apf" else Inflation.of_planner(problem.planner)
+    return Inflation(0.0) if planner == "apf" else Inflation.of_problem(problem)
 
 
 @dataclass(frozen=True)

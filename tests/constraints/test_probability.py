@@ -1,5 +1,7 @@
 """Chances by half-space, ball and disc: against published numbers, scipy's laws and brute force."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,9 +15,12 @@ from napf_mpc.constraints.probability import (
     ellipsoid_half_space_bound,
     exact_margins,
     half_space_probability,
+    mission_share,
     reach_margin,
     reach_probability,
 )
+from napf_mpc.first_passage import mission_k
+from napf_mpc.navigation.processes import gauss_markov
 
 OFFSET = np.array([0.7, 0.7, 0.8])
 COVARIANCE = np.diag([0.04, 0.04, 0.01])
@@ -128,3 +133,38 @@ def test_the_bound_holds_for_any_covariance_and_anywhere_along_the_plane() -> No
             at = np.array([radius + margin[0, 0], *aside])
             hits = int((((at + errors) ** 2).sum(-1) < radius**2).sum())
             assert stats.beta.ppf(1e-5, max(hits, 1), 40_001 - hits) <= stats.norm.sf(1.6)
+
+
+@pytest.mark.parametrize("kind", [BALL, DISC])
+def test_a_missions_share_is_one_where_a_solid_is_a_wall(kind: int) -> None:
+
+    def share(radius: float, tau: float, risk: float = 0.05) -> float:
+        k = mission_k(risk, 15.0, tau, 0.1)
+        return mission_share(kind, radius, 9.0, k, risk, 15.0, tau, 0.1)
+
+    assert share(1e4, 10.0) == pytest.approx(1.0, abs=1e-5)
+    assert share(1.0, 0.0) == pytest.approx(1.0, abs=0.03)  # white: each fix anew
+    assert share(1.0, math.inf) == 1.0  # constant: one draw
+    small, large = share(0.5, 10.0), share(2.0, 10.0)
+    assert 0.0 < small < large < 1.0
+
+
+@pytest.mark.parametrize(("kind", "axes"), [(BALL, 3), (DISC, 2)])
+@pytest.mark.parametrize("radius", [0.8, 2.3])
+@pytest.mark.parametrize("tau", [2.0, 10.0, 50.0])
+def test_a_mission_beside_a_small_solid_costs_a_third_to_the_whole_of_what_is_asked(
+    kind: int, axes: int, radius: float, tau: float
+) -> None:
+    """With the exact margin of one moment a ball of 0.8 m costs three times what is asked."""
+    runs, asked, sigma = 6000, 0.05, 3.0
+    k = mission_k(asked, 15.0, tau, 0.1)
+    margin = np.empty((1, 2))
+    kinds, sizes = np.array([[kind, HALF_SPACE]]), np.full((1, 2), radius)
+    normal, covariance = np.tile([1.0, 0.0, 0.0], (1, 2, 1)), sigma**2 * np.eye(3)[None]
+    exact_margins(kinds, sizes, normal, covariance, k, margin, asked, 15.0, tau, 0.1)
+    assert 0.0 <= margin[0, 0] <= margin[0, 1] == pytest.approx(k * sigma)
+    error = sigma * gauss_markov(np.random.default_rng(6).standard_normal((runs, axes, 150)), 0.1, tau)
+    error[:, 0] += radius + margin[0, 0]
+    achieved = float(((error**2).sum(1) <= radius**2).any(-1).mean())
+    spread = 3.0 * math.sqrt(asked / runs)
+    assert 0.3 * asked - spread <= achieved <= asked + spread
