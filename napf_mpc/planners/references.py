@@ -17,8 +17,6 @@ POSITION, VELOCITY = slice(0, 6, 2), slice(1, 6, 2)
 
 LARGEST_PULL_M = 3.0
 """A slot farther than this counts as this far: the UAV comes back at its speed limit, without a lunge."""
-TRUSTED_M = 1.5
-"""Sigma at which half of a distance to the slot is believed [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,16 +51,15 @@ class SlotReference:
         times_s : array, shape (N,)
             From now [s].
         sigma_m : array, shape (run, uav)
-            Reported standard deviation of the position [m]. A distance to the slot is believed, and so asked
-            for, by the part ``1 / (1 + (sigma / TRUSTED_M)^2)``: what is left is mostly navigation error,
-            and chasing it would move the truth off the slot.
+            Reported standard deviation of the position [m]. A distance e to the slot is believed, and so
+            asked for, by the part ``e^2 / (e^2 + sigma^2)``: below sigma it is mostly navigation error, and
+            chasing that would move the truth off the slot.
         guide : Guide, optional
             Offsets from the lanes, and pace.
         """
         place = self.frame.to_path(position)
         ahead = synchronisation_error(place[..., 0], self.offsets[:, 0])
-        belief = 1.0 / (1.0 + (np.asarray(sigma_m) / TRUSTED_M) ** 2)
-        behind = belief * np.clip(-ahead, -LARGEST_PULL_M, LARGEST_PULL_M)
+        behind = _believed(ahead, sigma_m) * np.clip(-ahead, -LARGEST_PULL_M, LARGEST_PULL_M)
         pace = np.ones(ahead.shape) if guide is None else guide.pace
         speed = np.repeat((self.speed_mps * pace)[..., None], len(times_s), axis=-1)
         along = behind[..., None] + speed * times_s
@@ -71,7 +68,7 @@ class SlotReference:
         here = np.zeros((*ahead.shape, 2)) if guide is None else guide.at(behind[..., None])[:, :, 0]
         away = self.offsets[:, 1:] + here - place[..., 1:]
         size = np.sqrt(away[..., 0] ** 2 + away[..., 1] ** 2)
-        pull = belief * LARGEST_PULL_M / np.maximum(size, LARGEST_PULL_M)
+        pull = _believed(size, sigma_m) * LARGEST_PULL_M / np.maximum(size, LARGEST_PULL_M)
         across = (away * pull[..., None] - here)[:, :, None] + bend
         out = np.zeros((*along.shape, STATES))
         to_slot = np.concatenate([along[..., None], across], axis=-1)
@@ -80,3 +77,9 @@ class SlotReference:
         out[..., VELOCITY] = self.frame.directions_to_world(velocity)
         out[..., 10] = self.frame.heading_rad
         return out
+
+
+def _believed(distance_m: Array, sigma_m: Array | float) -> Array:
+    """Part of a distance that is not put down to navigation errors."""
+    square = distance_m**2
+    return np.asarray(square / np.maximum(square + np.asarray(sigma_m) ** 2, 1e-12))
