@@ -68,7 +68,8 @@ class _Home:
         size = capacity(n, rows, groups)
         return cls(
             horizon.model, layout, maps,
-            np.array(signals, dtype=np.int64).reshape(-1, WIDTH), np.array(starts, dtype=np.int64).reshape(-1, 4),
+            np.array(signals, dtype=np.int64).reshape(-1, WIDTH),
+            np.array(starts, dtype=np.int64).reshape(-1, 4),
             RowTable.empty(CHUNK, rows, groups),
             np.empty((size, len(TARGETS) * n)), np.empty((size, size)), np.empty((size, size)),
         )  # fmt: skip
@@ -180,7 +181,7 @@ def _result(
             messages[run, uav] = (
                 why_unusable(layout, horizon, run, uav) if ends[i] == UNUSABLE else _MESSAGES[ends[i]]
             )
-    z, y = z.reshape(runs, uavs, -1), y.reshape(runs, uavs, -1)
+    z, y = z.reshape(runs, uavs, z.shape[1]), y.reshape(runs, uavs, y.shape[1])
     primal, dual, complementarity = residuals.T.reshape(3, runs, uavs)
     return BatchResult(
         _CODES[ends].reshape(runs, uavs), layout.states(z), layout.inputs(z), layout.block_slacks(z),

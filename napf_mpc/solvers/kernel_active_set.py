@@ -6,8 +6,9 @@ one: its row is dropped). The Cholesky factor of the working set's Gram matrix i
 
 A group of rows with the slack s, priced ``w1 s + w2 s^2 / 2``, is *closed* while the sum of its multipliers
 is below w1: then s = 0. It is *open* beyond: then ``s = (sum - w1) / w2``, which adds ``1 / w2`` to the Gram
-entries among its rows. In the method's own terms, a closed group is the row ``s >= 0`` in the working set with
-the multiplier ``w1 - sum``; opening drops that row, closing adds it. A group with w1 <= 0 is always open.
+entries among its rows. In the method's own terms, a closed group is the row ``s >= 0`` in the working set
+with the multiplier ``w1 - sum``; opening drops that row, closing adds it. A group with w1 <= 0 is always
+open.
 
 D. Goldfarb, A. Idnani, "A numerically stable dual method for solving strictly convex quadratic programs",
 Mathematical Programming 27 (1983).
@@ -31,6 +32,12 @@ DEPENDENT = 1e-11
 """A row of which less than this part is new to the working set depends on it."""
 TOUCH = 1e-11
 """A row violated by less than this part of its bound, or of one unit, is met."""
+NOISE = 1e-10
+"""Relative change of a multiplier below which it is rounding."""
+ROUNDING = 1e-12
+"""Part of the forces on a row that may be rounding."""
+SET_ASIDE = 4
+"""Mark of a row that is met as well as rounding allows, beside those of its sides."""
 WORKING, OPENED, FREE, STEPS, SUSPECTS = 0, 1, 2, 3, 4
 """Places of the counters of a :class:`WorkingSet`."""
 
@@ -41,7 +48,7 @@ class Program(NamedTuple):
     number: Array
     place: Small
     u: int
-    count: int
+    rows: int
 
 
 class WorkingSet(NamedTuple):
@@ -68,7 +75,7 @@ class WorkingSet(NamedTuple):
     free: Index
     """(capacity,) slots not in use."""
     member: Index
-    """(rows,) 1 if the row stands at its lower bound, 2 if at its upper, 3 if at both."""
+    """(rows,) 1 if the row stands at its lower bound, 2 if at its upper, 3 if at both; see SET_ASIDE."""
     is_open: NDArray[np.bool_]
     """(groups,)."""
     slack: Array
@@ -174,7 +181,7 @@ def backward(work: WorkingSet, n: int, values: Array) -> None:
 
 @compiled
 def widen(work: WorkingSet, first: int, n: int, extra: Array) -> None:
-    """Factor of the Gram matrix plus ``extra extra'``, which is zero before the first member; spoils extra."""
+    """Factor of the Gram matrix plus ``extra extra'``, zero before the first member; spoils extra."""
     for k in range(first, n):
         old = work.factor[k, k]
         new = np.sqrt(old * old + extra[k] * extra[k])
@@ -335,7 +342,7 @@ def violation_of(program: Program, work: WorkingSet, row: int, signals: Array) -
 def find_suspects(program: Program, work: WorkingSet, signals: Array) -> None:
     """Look at all rows and note those that are violated."""
     count = 0
-    for r in range(program.count):
+    for r in range(program.rows):
         violation, _ = violation_of(program, work, r, signals)
         if violation > TOUCH:
             work.suspect[count] = r
@@ -344,21 +351,71 @@ def find_suspects(program: Program, work: WorkingSet, signals: Array) -> None:
 
 
 @compiled
-def most_violated(program: Program, work: WorkingSet, signals: Array) -> tuple[int, float, float]:
-    """Suspect (or -1 - place of an opened group) that is violated most, its side, and by how much, or zero."""
-    found, where, most = 0, 1.0, 0.0
+def most_violated(
+    program: Program, work: WorkingSet, signals: Array, floor: float
+) -> tuple[int, float, float]:
+    """Suspect (or -1 - place of an opened group) violated most, its side, by how much; zero for none."""
+    found, where, most = 0, 1.0, floor
     for e in range(work.counter[SUSPECTS]):
         r = work.suspect[e]
         violation, side = violation_of(program, work, r, signals)
         if violation > most:
             bound = program.number[program.u, r, LOW] if side > 0.0 else program.number[program.u, r, HIGH]
-            if violation > TOUCH * max(1.0, abs(bound)) and not work.member[r] & (1 if side > 0.0 else 2):
+            kept = SET_ASIDE | (1 if side > 0.0 else 2)
+            if violation > TOUCH * max(1.0, abs(bound)) and not work.member[r] & kept:
                 found, where, most = r, side, violation
     for e in range(work.counter[OPENED]):
         below = -work.slack[work.opened[e]]
         if below > most and below > TOUCH:
             found, where, most = -1 - e, 1.0, below
-    return found, where, most
+    return found, where, most if most > floor else 0.0
+
+
+@compiled
+def lower_bound(program: Program, row: int, side: float) -> float:
+    """Bound of a row on the side where it stands, as that of ``side * row >= bound``."""
+    if side > 0.0:
+        return float(program.number[program.u, row, LOW])
+    return -float(program.number[program.u, row, HIGH])
+
+
+@compiled
+def largest_miss(program: Program, work: WorkingSet, signals: Array) -> float:
+    """By how much the members miss their bounds at most."""
+    most = 0.0
+    for j in range(work.counter[WORKING]):
+        row, side = work.row[j], work.side[j]
+        miss = lower_bound(program, row, side) - side * row_value(program, row, signals)
+        most = max(most, abs(miss - work.slack[program.place[program.u, row, GROUP]]))
+    return most
+
+
+@compiled
+def polish(program: Program, work: WorkingSet, signals: Array) -> bool:
+    """Correct the multipliers for what the members miss their bounds by; return whether it mattered."""
+    n = work.counter[WORKING]
+    matters = False
+    for j in range(n):
+        row, side = work.row[j], work.side[j]
+        bound = lower_bound(program, row, side)
+        work.step[j] = bound - side * row_value(program, row, signals)
+        work.step[j] -= work.slack[program.place[program.u, row, GROUP]]
+        matters = matters or abs(work.step[j]) > 0.1 * TOUCH * max(1.0, abs(bound))
+    if matters:
+        forward(work, n, work.step)
+        backward(work, n, work.step)
+        for j in range(n):
+            work.mult[j] = max(0.0, work.mult[j] + work.step[j])
+    return matters
+
+
+@compiled
+def rounding(program: Program, work: WorkingSet, n: int) -> float:
+    """How exactly the row behind n members can be known under their multipliers."""
+    total = 0.0
+    for j in range(n):
+        total += work.mult[j] * abs(work.gram[work.slot[n], work.slot[j]])
+    return float(TOUCH + ROUNDING * total)
 
 
 @compiled
@@ -388,13 +445,21 @@ def ascend(
         :data:`OPTIMAL`, :data:`INFEASIBLE` or :data:`LIMIT`.
     """
     work.counter[SUSPECTS] = 0
+    for r in range(program.rows):
+        work.member[r] &= 3
     while True:
         sums(program, work)
         respond(work, base, signals)
-        found, side, violation = most_violated(program, work, signals)
+        floor = 0.0
+        if polish(program, work, signals):
+            sums(program, work)
+            respond(work, base, signals)
+            # What is left is the rounding of large forces that cancel.
+            floor = 4.0 * largest_miss(program, work, signals)
+        found, side, violation = most_violated(program, work, signals, floor)
         if violation == 0.0:
             find_suspects(program, work, signals)
-            found, side, violation = most_violated(program, work, signals)
+            found, side, violation = most_violated(program, work, signals, floor)
         if violation == 0.0:
             return OPTIMAL
         is_row = found >= 0
@@ -426,22 +491,32 @@ def ascend(
             independent = fresh > DEPENDENT * whole
             length = violation / fresh if independent else np.inf
             blocking, opening = -1, -1
+            # Without a full step to compare with, rounding must not pass for a multiplier that shrinks.
+            noise, largest = 0.0 if independent else NOISE * np.sqrt(whole), 1.0
             for j in range(n):
                 work.rate[program.place[program.u, work.row[j], GROUP]] = 0.0
-                if work.step[j] > 0.0 and work.mult[j] < length * work.step[j]:
+                largest = max(largest, abs(work.step[j]))
+                own = noise / np.sqrt(work.gram[work.slot[j], work.slot[j]]) if noise > 0.0 else 0.0
+                if work.step[j] > own and work.mult[j] < length * work.step[j]:
                     length, blocking = work.mult[j] / work.step[j], j
             if is_row:
                 work.rate[group] = 1.0
             for j in range(n):
                 work.rate[program.place[program.u, work.row[j], GROUP]] -= work.step[j]
+            noise = 0.0 if independent else NOISE * largest
             for j in range(n + waiting):
                 other = program.place[program.u, work.row[j], GROUP]
-                if not work.is_open[other] and work.rate[other] > 0.0:
+                if not work.is_open[other] and work.rate[other] > noise:
                     room = max(0.0, work.w1[other] - work.total[other])
                     if room < length * work.rate[other]:
                         length, blocking, opening = room / work.rate[other], -1, other
             if length == np.inf:
-                return INFEASIBLE
+                if not is_row or work.mult[n] > 0.0 or violation > rounding(program, work, n):
+                    return INFEASIBLE
+                # It depends on the members, and misses its bound by no more than their own rounding.
+                release(program, work, n, n + 1)
+                work.member[found] |= SET_ASIDE
+                break
             for j in range(n):
                 work.mult[j] -= length * work.step[j]
             if is_row:
@@ -458,6 +533,8 @@ def ascend(
             work.counter[WORKING] += waiting
             sums(program, work)
             work.counter[WORKING] -= waiting
+        if is_row and work.member[found] & SET_ASIDE:
+            continue
         if is_row:
             work.factor[n, n] = np.sqrt(fresh)
             for j in range(n):
@@ -465,12 +542,6 @@ def ascend(
             work.counter[WORKING] = n + 1
         elif not close_group(program, work, -1 - found):
             return LIMIT
-
-
-@compiled
-def lower_bound(program: Program, row: int, side: float) -> float:
-    """Bound of a row on the side where it stands, as that of ``side * row >= bound``."""
-    return program.number[program.u, row, LOW] if side > 0.0 else -program.number[program.u, row, HIGH]
 
 
 @compiled

@@ -17,11 +17,10 @@ from napf_mpc.solvers.kernel_active_set import (
     Program,
     WorkingSet,
     ascend,
-    backward,
     enter,
-    forward,
     lower_bound,
     mark_open,
+    polish,
     reset,
     resume,
     row_value,
@@ -180,20 +179,6 @@ def correct(program: Program, work: WorkingSet, room: Room) -> bool:
 
 
 @compiled
-def polish(program: Program, work: WorkingSet, room: Room) -> None:
-    """Multipliers with which the members meet their bounds after the base has moved."""
-    n = work.counter[WORKING]
-    for j in range(n):
-        row, side = work.row[j], work.side[j]
-        bound = lower_bound(program, row, side) - work.slack[program.place[program.u, row, GROUP]]
-        work.step[j] = bound - side * row_value(program, row, room.exact)
-    forward(work, n, work.step)
-    backward(work, n, work.step)
-    for j in range(n):
-        work.mult[j] = max(0.0, work.mult[j] + work.step[j])
-
-
-@compiled
 def solve_rows(
     maps: SignalMaps, program: Program, work: WorkingSet, room: Room, starts: Array, at: int, limit: int
 ) -> int:
@@ -206,7 +191,7 @@ def solve_rows(
         under_load(maps, program, work, room, starts, at)
         if not correct(program, work, room):
             break
-        polish(program, work, room)
+        polish(program, work, room.exact)
     else:
         sums(program, work)
         under_load(maps, program, work, room, starts, at)
@@ -218,13 +203,11 @@ def proximal(
     program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room
 ) -> bool:
     """Give slacks with next to no quadratic price one of their own; return whether there are any."""
-    any_soft, stiffest = False, 0.0
-    for i in range(len(room.base)):
-        stiffest = max(stiffest, maps.kernel[i, i])
+    any_soft = False
     for g in range(table.size[u, GROUPS]):
         room.previous[g], room.extra[g] = 0.0, 0.0
         work.w1[g], work.w2[g] = table.price[u, g, 0], table.price[u, g, 1]
-    for r in range(program.count):
+    for r in range(program.rows):
         g = program.place[program.u, r, GROUP]
         if g == table.price.shape[1] - 1:
             continue
@@ -232,7 +215,7 @@ def proximal(
         for d in range(WIDTH):
             size += program.number[program.u, r, d] ** 2
         # An upper bound of the row's own Gram entry first: it is cheap.
-        if table.price[u, g, 1] * size * 4.0 * stiffest < SOFTEST:
+        if table.price[u, g, 1] * size * 4.0 * maps.softest < SOFTEST:
             give = 0.0
             for d in range(WIDTH):
                 for e in range(WIDTH):
@@ -260,7 +243,7 @@ def guess(
     for g in range(table.size[u, GROUPS]):
         if work.w1[g] > 0.0 and z[at, table.put[u, g, 0]] > GUESSED:
             mark_open(work, g)
-    for r in range(program.count):
+    for r in range(program.rows):
         for side in (1.0, -1.0):
             bound = lower_bound(program, r, side)
             pushing = -y[at, table.place[u, r, Y_LOW]] if side > 0.0 else y[at, table.place[u, r, Y_HIGH]]
@@ -288,7 +271,7 @@ def again(program: Program, maps: SignalMaps, table: RowTable, u: int, work: Wor
     was_open = work.is_open.copy()
     for g in range(table.size[u, GROUPS]):
         work.w1[g] = table.price[u, g, 0] - room.extra[g] * room.previous[g]
-    reset(work, program.count, table.size[u, GROUPS])
+    reset(work, program.rows, table.size[u, GROUPS])
     for g in range(table.size[u, GROUPS]):
         if was_open[g] and not work.is_open[g]:
             mark_open(work, g)
@@ -305,7 +288,7 @@ def certify(
     maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room,
     starts: Array, at: int, z: Array, y: Array,
 ) -> float:  # fmt: skip
-    """Write slacks and multipliers, and residuals of the original program; return the largest relative one."""
+    """Write slacks, multipliers and residuals of the original program; return the largest relative one."""
     out = room.certificate
     stationarity(
         maps, starts, at, room.states, room.inputs, room.cost, room.linear, room.force,
@@ -327,7 +310,7 @@ def certify(
         out[3] = max(out[3], w1, w2 * slack, total)
         out[4] = max(out[4], mult * slack)
         work.slack[g] = slack
-    for r in range(program.count):
+    for r in range(program.rows):
         value, slack = row_value(program, r, room.exact), work.slack[program.place[program.u, r, GROUP]]
         low, high = program.number[program.u, r, LOW], program.number[program.u, r, HIGH]
         out[0] = max(out[0], low - value - slack, value - high - slack)
@@ -357,14 +340,15 @@ def certify(
 @compiled
 def clear_multipliers(program: Program, table: RowTable, u: int, y: Array, at: int) -> None:
     """Zero the multipliers of all rows before they are written again."""
-    for r in range(program.count):
+    for r in range(program.rows):
         y[at, table.place[u, r, Y_LOW]], y[at, table.place[u, r, Y_HIGH]] = 0.0, 0.0
 
 
 @compiled
 def solve_one(
-    maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room, starts: Array, references: Array, at: int,
-    warm: bool, guess_z: Array, guess_y: Array, guess_at: int, limit: int, z: Array, y: Array,
+    maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room, starts: Array,
+    references: Array, at: int, warm: bool, guess_z: Array, guess_y: Array, guess_at: int,
+    limit: int, z: Array, y: Array,
 ) -> int:  # fmt: skip
     """Solve program u of a table; return how it ended."""
     if table.size[u, USABLE] == 0 or not unconstrained(maps, room, starts, references, at):
@@ -376,7 +360,7 @@ def solve_one(
             # The corrections of the first attempt go with its multipliers.
             unconstrained(maps, room, starts, references, at)
         softest = proximal(program, maps, table, u, work, room)
-        reset(work, program.count, table.size[u, GROUPS])
+        reset(work, program.rows, table.size[u, GROUPS])
         guessed = warm and attempt == 0 and guess(program, maps, table, u, work, guess_z, guess_y, guess_at)
         if guessed:
             resume(program, work, room.base)

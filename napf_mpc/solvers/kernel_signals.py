@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse.csgraph import connected_components
 
+from napf_mpc.constraints.constraint import SIGNALS
 from napf_mpc.jit import compiled
-from napf_mpc.qp import INPUTS, SIGNALS, STATES, Array, HorizonModel, Index, QpError
+from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, Index, QpError
 
 KINDS = tuple(SIGNALS)
 """Kinds of signals in the order of their numbers."""
@@ -64,6 +65,8 @@ class SignalMaps(NamedTuple):
     """(13 N,) place of each signal in state and input, see :data:`TARGETS`."""
     stage: Small
     """(13 N,) its stage."""
+    softest: float
+    """Largest diagonal entry of the kernel: no unit row is easier to move."""
 
 
 def signal_maps(model: HorizonModel) -> SignalMaps:
@@ -110,6 +113,7 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
         place,
         np.repeat(TARGETS[order], n).astype(np.uint32),
         np.tile(np.arange(n), len(TARGETS)).astype(np.uint32),
+        float(np.diag(kernel).max()),
     )
 
 
@@ -132,8 +136,8 @@ def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Small, Small, Array]:
         columns.append(column)
         values.append(matrix[stage, row, column])
         count += len(stage)
-    row, column = (np.concatenate(v).astype(np.uint32) for v in (rows, columns))
-    return begins, row, column, np.concatenate(values)
+    places = [np.concatenate(v).astype(np.uint32) for v in (rows, columns)]
+    return begins, places[0], places[1], np.concatenate(values)
 
 
 def _inverse_root(hessian: Array, stage: int) -> Array:
@@ -175,9 +179,9 @@ def _chains(kernel: Array, stages: int) -> tuple[Index, Index]:
     """Order of the 13 signals chain by chain, and the chain of each signal."""
     size = np.sqrt(np.diag(kernel))
     size = np.where(size > 0.0, size, 1.0)
-    near = np.abs(kernel) / size[:, None] / size > LOOSE
+    near = np.asarray(np.abs(kernel) / size[:, None] / size > LOOSE)
     count = len(TARGETS)
-    linked = near.reshape(count, stages, count, stages).any(axis=(1, 3))
+    linked = np.asarray(near.reshape(count, stages, count, stages).any(axis=(1, 3)), dtype=float)
     _, chain = connected_components(linked, directed=False)
     return np.argsort(chain, kind="stable"), chain.astype(np.int64)
 

@@ -110,3 +110,494 @@ def relative_residuals(horizon: HorizonQp, result: BatchResult) -> Array:
         )
         out[run, uav] = max(got.primal / primal, got.dual / dual, got.complementarity / product)
     return out
+
+
+# --- The same method in plain NumPy -----------------------------------------------------------------------
+
+
+class Oracle:
+    """Goldfarb and Idnani on the condensed program of one UAV, with a dense solve for every step.
+
+    Rows are ``n' u + s >= bound``; a group's slack is zero while the group is closed.
+    """
+
+    def __init__(self, horizon: HorizonQp, run: int, uav: int) -> None:
+        model, stages = horizon.model, horizon.model.stages
+        moved, drift = np.zeros((stages, 12, 4 * stages)), np.zeros((stages, 12))
+        state, free = np.zeros((12, 4 * stages)), horizon.initial[run, uav]
+        for k in range(stages):
+            state, free = model.a[k] @ state, model.a[k] @ free
+            state[:, 4 * k : 4 * k + 4] += model.b[k]
+            moved[k], drift[k] = state, free
+        flat = moved.reshape(-1, 4 * stages)
+        hessian = flat.T @ block_diag(*model.q) @ flat + block_diag(*model.r)
+        pull = flat.T @ block_diag(*model.q) @ (drift - horizon.reference[run, uav]).ravel()
+        self.hessian, self.free = hessian, -np.linalg.solve(hessian, pull)
+        self.moved, self.drift = moved, drift
+        self.normals: list[Array] = []
+        self.bounds: list[float] = []
+        self.groups: list[int] = []
+        self.prices: list[tuple[float, float]] = []
+        for block in horizon.rows:
+            self._add(block, model, run, uav)
+
+    def _add(self, block: LinearRows, model: HorizonModel, run: int, uav: int) -> None:
+        places = np.array(SIGNALS[block.signal])
+        for k in range(model.stages):
+            signal = (
+                np.eye(4 * model.stages)[4 * k + places] if block.signal == "input" else self.moved[k, places]
+            )
+            offset = np.zeros(len(places)) if block.signal == "input" else self.drift[k, places]
+            first = len(self.prices)
+            if block.w1 is not None and block.w2 is not None:
+                both = zip(block.w1[run, uav, k], block.w2[run, uav, k], strict=True)
+                self.prices += [(w1 * model.step_s[k], w2 * model.step_s[k]) for w1, w2 in both]
+            for j, jac in enumerate(block.jac[run, uav, k]):
+                for sign, bound in ((1.0, block.lower), (-1.0, block.upper)):
+                    if bound is not None and np.isfinite(bound[run, uav, k, j]):
+                        self.normals.append(sign * jac @ signal)
+                        self.bounds.append(sign * (bound[run, uav, k, j] - jac @ offset))
+                        self.groups.append(
+                            -1 if not block.soft else first if block.shared_slack else first + j
+                        )
+
+    def solve(self) -> tuple[QpStatus, Array]:
+        """Status and inputs (4 N,)."""
+        if not self.normals:
+            return QpStatus.SOLVED, self.free
+        normals, bounds, groups = np.array(self.normals), np.array(self.bounds), np.array(self.groups)
+        response = np.linalg.solve(self.hessian, normals.T)
+        gram = normals @ response
+        w1 = np.array([w for w, _ in self.prices] + [INF])
+        w2 = np.array([w for _, w in self.prices] + [1.0])
+        is_open, mult, members = w1 <= 0.0, np.zeros(len(bounds)), []
+        for _ in range(2000):
+            total = np.bincount(groups % len(w1), mult, len(w1))
+            slack = np.where(is_open, (total - np.where(is_open, w1, 0.0)) / w2, 0.0)
+            violation = bounds - normals @ self.free - gram @ mult - slack[groups]
+            violation[members] = 0.0
+            row, group = int(violation.argmax()), int(slack.argmin())
+            if max(violation[row], -slack[group]) < 1e-10:
+                return QpStatus.SOLVED, self.free + response @ mult
+            closing = -slack[group] > violation[row]
+            group = group if closing else int(groups[row])
+            left = -slack[group] if closing else violation[row]
+            while True:
+                tie = (groups[:, None] == groups) * np.where(is_open, 1.0 / w2, 0.0)[groups]
+                whole = gram + tie
+                new = (groups[members] == group) / w2[group] if closing else whole[members, row]
+                size = 1.0 / w2[group] if closing else whole[row, row]
+                step = np.linalg.solve(whole[np.ix_(members, members)], new)
+                fresh = size - new @ step
+                change = np.zeros(len(bounds))
+                change[members] = -step
+                if not closing:
+                    change[row] = 1.0
+                rate = np.bincount(groups % len(w1), change, len(w1))
+                total = np.bincount(groups % len(w1), mult, len(w1))
+                lengths = [(left / fresh if fresh > 1e-10 * size else INF, "full", 0)]
+                lengths += [(mult[j] / -change[j], "drop", j) for j in members if change[j] < 0.0]
+                lengths += [
+                    ((w1[g] - total[g]) / rate[g], "open", g) for g in np.flatnonzero(~is_open & (rate > 0.0))
+                ]
+                length, event, which = min(lengths)
+                if length == INF:
+                    return QpStatus.PRIMAL_INFEASIBLE, self.free * np.nan
+                mult += length * change
+                left -= length * fresh
+                if event == "drop":
+                    members.remove(which)
+                    mult[which] = 0.0
+                elif event == "open":
+                    is_open[which] = True
+                else:
+                    break
+            if closing:
+                is_open[group] = False
+            else:
+                members.append(row)
+        return QpStatus.MAX_ITERATIONS, self.free * np.nan
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_method_in_plain_numpy_says_the_same(seed: int) -> None:
+    horizon = mixed(seed, model=hover_model(GRID, 0.3 * (seed % 3)))
+    result = make_batch_solver("kernel").solve_batch(horizon)
+    for run, uav in np.ndindex(*result.status.shape):
+        status, inputs = Oracle(horizon, run, uav).solve()
+        assert status is QpStatus.SOLVED
+        assert result.status[run, uav] == SOLVED
+        np.testing.assert_allclose(result.inputs[run, uav].ravel(), inputs, atol=1e-6)
+
+
+# --- Right answers ----------------------------------------------------------------------------------------
+
+MODELS = {
+    "uneven": (GRID, 0.0),
+    "planner": (LONG_GRID, 0.0),
+    "turned": (GRID, 0.7),
+    "even": ((0.1,) * 12, 0.0),
+    "one_stage": ((0.5,), 0.0),
+    "fine": ((0.05,) * 30, -2.0),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("far_m", [0.0, 100.0])
+def test_every_program_is_certified(name: str, far_m: float) -> None:
+    """The certificate is the solver's own word; here it is taken again from the plain matrices."""
+    model, solver = hover_model(*MODELS[name]), make_batch_solver("kernel")
+    for seed in range(4):
+        horizon = mixed(seed, 3, 2, model, far_m)
+        result = solver.solve_batch(horizon)
+        assert (result.status == SOLVED).all(), result.messages
+        assert relative_residuals(horizon, result).max() < 1e-9
+        layout = Layout.of(horizon)
+        told = (result.primal, result.dual, result.complementarity)
+        again = kkt_residuals(layout.sparsity, layout.values(horizon), result.z, result.y)
+        for mine, theirs in zip(told, again, strict=True):
+            np.testing.assert_allclose(mine, theirs, atol=1e-8)
+        warm = solver.solve_batch(horizon, WarmStart(result.z, result.y))
+        assert relative_residuals(horizon, warm).max() < 1e-9
+        assert warm.iterations.max() <= max(4, result.iterations.max() // 4)
+        np.testing.assert_allclose(warm.inputs, result.inputs, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_thousands_of_programs_are_certified() -> None:
+    solver, count = make_batch_solver("kernel"), 0
+    for seed in range(100, 160):
+        horizon = mixed(seed, 16, 4, hover_model(*list(MODELS.values())[seed % len(MODELS)]))
+        result = solver.solve_batch(horizon)
+        layout = Layout.of(horizon)
+        residuals = kkt_residuals(layout.sparsity, layout.values(horizon), result.z, result.y)
+        assert (result.status == SOLVED).all(), (seed, result.messages)
+        assert max(float(r.max()) for r in residuals) < 1e-8, seed
+        count += result.status.size
+    assert count > 3000
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("osqp", {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 20000}),
+        ("piqp", {"eps_abs": 1e-11, "eps_rel": 1e-11, "check_duality_gap": True}),
+        ("daqp", {}),
+    ],
+)
+def test_other_solvers_say_the_same(name: str, settings: dict[str, object]) -> None:
+    try:
+        other = make_batch_solver(name, **settings)
+    except SolverError:
+        pytest.skip(f"{name} is not installed")
+    for seed in range(4):
+        horizon = mixed(seed, 2, 2)
+        mine, theirs = make_batch_solver("kernel").solve_batch(horizon), other.solve_batch(horizon)
+        for run, uav in np.argwhere(theirs.status == SOLVED).tolist():
+            program = horizon.assemble(run, uav)
+            best = program.objective(mine.z[run, uav])
+            assert best <= program.objective(theirs.z[run, uav]) + 1e-6 * max(1.0, abs(best))
+            np.testing.assert_allclose(mine.inputs[run, uav, 0], theirs.inputs[run, uav, 0], atol=2e-4)
+        assert (theirs.status == SOLVED).any()
+
+
+# --- Corners ----------------------------------------------------------------------------------------------
+
+
+def one(*rows: LinearRows, pull_m: float = 10.0, model: HorizonModel | None = None) -> HorizonQp:
+    """A UAV at rest at the origin that is pulled along x."""
+    model = hover_model() if model is None else model
+    reference = np.zeros((1, 1, model.stages, 12))
+    reference[..., 0] = pull_m
+    horizon = HorizonQp(model, np.zeros((1, 1, 12)), reference, rows)
+    horizon.check_shapes()
+    return horizon
+
+
+def everywhere(values: object, stages: int = len(GRID)) -> Array:
+    array = np.asarray(values, dtype=float)
+    return np.broadcast_to(array, (1, 1, stages, *array.shape)).copy()
+
+
+def wall(
+    x_m: float, w1: float, w2: float, copies: int = 1, shared: bool = False, sign: float = 1.0
+) -> LinearRows:
+    """Soft wall ``sign x <= x_m``."""
+    prices = [everywhere([w] * (1 if shared else copies)) for w in (w1, w2)]
+    jac = everywhere([[sign, 0.0, 0.0]] * copies)
+    return LinearRows("position", jac, None, everywhere([x_m] * copies), *prices, shared_slack=shared)
+
+
+def certified(horizon: HorizonQp) -> BatchResult:
+    result = make_batch_solver("kernel").solve_batch(horizon)
+    assert (result.status == SOLVED).all(), result.messages
+    assert relative_residuals(horizon, result).max() < 1e-9
+    return result
+
+
+def test_no_rows_and_rows_that_are_all_inactive_give_the_same_plan() -> None:
+    bare = certified(one())
+    off = certified(one(wall(INF, 1.0, 1.0), wall(1e6, 100.0, 0.0, copies=3, shared=True)))
+    np.testing.assert_array_equal(bare.states, off.states)
+    assert bare.iterations[0, 0] == 0
+    assert off.slacks[1].max() == 0.0
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize(("w1", "w2"), [(500.0, 10.0), (0.0, 10.0), (0.5, 0.1), (500.0, 0.0), (0.5, 0.0)])
+def test_repeated_rows_count_once_if_they_share_a_slack(w1: float, w2: float, shared: bool) -> None:
+    single, many = certified(one(wall(0.2, w1, w2))), certified(one(wall(0.2, w1, w2, 4, shared)))
+    if shared:
+        np.testing.assert_allclose(many.states, single.states, atol=1e-8)
+    # Four slacks of a quarter of the price are one slack.
+    quarter = certified(one(wall(0.2, w1 / 4.0, w2 / 4.0, 4)))
+    np.testing.assert_allclose(quarter.states, single.states, atol=1e-8)
+
+
+@pytest.mark.parametrize("w2", [0.0, 1e-9, 1e-3])
+def test_a_linear_price_is_a_bounded_force(w2: float) -> None:
+    """A slack with no quadratic price is undetermined by it; its multiplier then stands at the price."""
+    horizon = one(wall(-1.0, 2.0, w2))
+    result = certified(horizon)
+    push = result.y[0, 0, 12 * len(GRID) : 13 * len(GRID)]
+    opened = result.slacks[0][0, 0, :, 0] > 1e-6
+    assert opened.any()
+    expected = (2.0 + w2 * result.slacks[0][0, 0, :, 0]) * np.array(GRID)
+    np.testing.assert_allclose(push[opened], expected[opened], rtol=1e-9)
+    assert (push <= expected * (1.0 + 1e-9)).all()
+
+
+def test_a_slack_that_costs_nothing_holds_nothing() -> None:
+    result = certified(one(wall(-1.0, 0.0, 0.0)))
+    np.testing.assert_allclose(result.states, certified(one()).states, atol=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e3])
+def test_the_dearer_of_two_walls_that_exclude_each_other_wins(ratio: float) -> None:
+    result = certified(one(wall(-1.0, 10.0 * ratio, ratio), wall(-1.5, 10.0, 1.0, sign=-1.0), pull_m=0.25))
+    dear, cheap = (slack[0, 0, -1, 0] for slack in result.slacks)
+    # x <= -1 and x >= 1.5: between them lie 2.5 m.
+    assert dear + cheap == pytest.approx(2.5, abs=1e-9)
+    if ratio > 1.0:
+        assert dear < 1e-3 < cheap
+
+
+def test_two_sides_that_exclude_each_other_share_their_slack() -> None:
+    block = LinearRows(
+        "position", everywhere([[1.0, 0.0, 0.0]]), everywhere([3.0]), everywhere([1.0]),
+        everywhere([1000.0]), everywhere([100.0]),
+    )  # fmt: skip
+    result = certified(one(block))
+    # The least that serves both is one metre.
+    assert result.slacks[0][0, 0, -1, 0] == pytest.approx(1.0, abs=1e-9)
+    assert result.states[0, 0, -1, 0] == pytest.approx(2.0, abs=1e-9)
+
+
+def test_hard_rows() -> None:
+    limit = everywhere([0.5] * 4)
+    box = LinearRows("input", everywhere(np.eye(4)), -limit, limit)
+    result = certified(one(box))
+    assert np.abs(result.inputs).max() <= 0.5 + 1e-9
+    fixed = LinearRows("input", everywhere(np.eye(4)), 0.1 * limit, 0.1 * limit)
+    np.testing.assert_allclose(certified(one(box, fixed)).inputs, 0.05, atol=1e-9)
+    # The same rows again, and their sum, depend on those before.
+    again = LinearRows("input", everywhere(np.ones((2, 4))), everywhere([0.2, 0.2]), everywhere([0.2, 0.2]))
+    np.testing.assert_allclose(certified(one(box, fixed, again)).inputs, 0.05, atol=1e-9)
+
+
+def test_hard_rows_that_contradict_each_other_are_infeasible_and_harm_no_other() -> None:
+    horizon = mixed(3, 2, 2)
+    rows = horizon.rows[-1]
+    assert rows.lower is not None
+    assert rows.upper is not None
+    sum_of_all = LinearRows(
+        "input", rows.jac.sum(axis=3, keepdims=True), None, rows.lower.sum(axis=3, keepdims=True) + 1.0
+    )
+    sum_of_all.upper[1, 0, 2] = rows.lower[1, 0, 2].sum() - 1e-3  # type: ignore[index]
+    sum_of_all.upper[0] = sum_of_all.upper[1, 1] = INF  # type: ignore[index]
+    solver = make_batch_solver("kernel")
+    result = solver.solve_batch(replace(horizon, rows=(*horizon.rows, sum_of_all)))
+    assert result.status[1, 0] == CODE[QpStatus.PRIMAL_INFEASIBLE]
+    assert list(result.messages) == [(1, 0)]
+    assert np.isnan(result.z[1, 0]).all()
+    assert np.isinf(result.primal[1, 0])
+    assert (np.delete(result.status.ravel(), 2) == SOLVED).all()
+
+
+def test_a_row_without_coefficients() -> None:
+    zero = wall(1.0, 5.0, 1.0, sign=0.0)
+    np.testing.assert_array_equal(certified(one(zero)).states, certified(one()).states)
+    missed = certified(one(wall(-1.0, 5.0, 1.0, sign=0.0)))
+    np.testing.assert_allclose(missed.slacks[0], 1.0, atol=1e-12)
+    hard = LinearRows("position", everywhere([[0.0, 0.0, 0.0]]), everywhere([1.0]))
+    assert make_batch_solver("kernel").solve_batch(one(hard)).status[0, 0] == CODE[QpStatus.PRIMAL_INFEASIBLE]
+
+
+def test_limit_of_steps() -> None:
+    result = make_batch_solver("kernel", max_iter=3).solve_batch(mixed(3))
+    assert (result.status == CODE[QpStatus.MAX_ITERATIONS]).any()
+    assert result.iterations.max() <= 3
+    with pytest.raises(SolverError, match="max_iter = 0"):
+        make_batch_solver("kernel", max_iter=0)
+    with pytest.raises(SolverError, match="speed"):
+        make_batch_solver("kernel", speed=3)
+
+
+def test_a_cost_that_leaves_an_input_undetermined_is_refused() -> None:
+    model = hover_model()
+    blind = replace(model, r=np.zeros_like(model.r), b=model.b * np.array([1.0, 1.0, 1.0, 0.0]))
+    with pytest.raises(QpError, match=r'do(es)? not determine the inputs.*"osqp"'):
+        make_batch_solver("kernel").solve_batch(one(model=blind))
+
+
+# --- Batches, histories, guesses --------------------------------------------------------------------------
+
+
+def cut(horizon: HorizonQp, run: int, uav: int) -> HorizonQp:
+    def own(values: Array | None) -> Array | None:
+        return None if values is None else values[run : run + 1, uav : uav + 1]
+
+    rows = tuple(
+        replace(
+            b, jac=b.jac[run : run + 1, uav : uav + 1],
+            lower=own(b.lower), upper=own(b.upper), w1=own(b.w1), w2=own(b.w2),
+        )
+        for b in horizon.rows
+    )  # fmt: skip
+    start, reference = (v[run : run + 1, uav : uav + 1] for v in (horizon.initial, horizon.reference))
+    return HorizonQp(horizon.model, start, reference, rows)
+
+
+def test_an_answer_depends_on_its_own_numbers_and_guess_alone() -> None:
+    """40 programs are more than one chunk; three steps with warm starts, one with another layout between."""
+    together, alone = make_batch_solver("kernel"), make_batch_solver("kernel")
+    warm: WarmStart | None = None
+    for seed in (1, 2, 3):
+        horizon = mixed(seed, 10, 4)
+        whole = together.solve_batch(horizon, warm)
+        together.solve_batch(mixed(seed, 1, 2, hover_model(LONG_GRID)))
+        for run, uav in ((0, 0), (4, 3), (9, 1)):
+            at = (slice(run, run + 1), slice(uav, uav + 1))
+            guess = None if warm is None else WarmStart(warm.z[at], warm.y[at])
+            single = alone.solve_batch(cut(horizon, run, uav), guess)
+            np.testing.assert_array_equal(single.z[0, 0], whole.z[run, uav])
+            np.testing.assert_array_equal(single.y[0, 0], whole.y[run, uav])
+            assert single.iterations[0, 0] == whole.iterations[run, uav]
+        warm = whole.warm_start(whole.states, whole.inputs)
+
+
+def test_guesses_of_any_quality_lead_to_the_same_answer() -> None:
+    rng = np.random.default_rng(0)
+    for seed in range(6):
+        horizon = mixed(seed)
+        solver = make_batch_solver("kernel")
+        cold = solver.solve_batch(horizon)
+        guesses = [
+            WarmStart(cold.z * np.nan, cold.y),
+            WarmStart(cold.z, rng.normal(size=cold.y.shape) * 10.0),
+            WarmStart(rng.normal(size=cold.z.shape), -cold.y),
+            WarmStart(cold.z * 1e9, cold.y * 1e9),
+        ]
+        for guess in guesses:
+            result = solver.solve_batch(horizon, guess)
+            assert (result.status == SOLVED).all(), result.messages
+            np.testing.assert_allclose(result.inputs, cold.inputs, atol=1e-6)
+        np.testing.assert_array_equal(solver.solve_batch(horizon, guesses[0]).z, cold.z)
+
+
+def test_warm_starts_along_a_flight_save_steps() -> None:
+    """A UAV drifts past a wall that comes nearer: the rows that push change little from step to step."""
+    solver, cold_steps, warm_steps = make_batch_solver("kernel"), 0, 0
+    warm: WarmStart | None = None
+    for step in range(30):
+        model = hover_model(LONG_GRID)
+        base = mixed(5, 2, 2, model)
+        drifted = replace(base, initial=base.initial + 0.02 * step * np.eye(12)[0])
+        cold, result = solver.solve_batch(drifted), solver.solve_batch(drifted, warm)
+        np.testing.assert_allclose(result.inputs, cold.inputs, atol=1e-6)
+        assert (result.status == SOLVED).all()
+        if warm is not None:
+            cold_steps, warm_steps = cold_steps + cold.iterations.sum(), warm_steps + result.iterations.sum()
+        warm = result.warm_start(result.states, result.inputs)
+    assert warm_steps < 0.5 * cold_steps
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        ("initial", "NaN"),
+        ("reference", "q has an entry that is not finite"),
+        ("jac", "A has an entry that is not finite"),
+        ("bound", "NaN"),
+        ("crossed", r"l\[\d+\] = 1e\+09 > u"),
+        ("negative", "negative penalty"),
+        ("infinite", "q has an entry that is not finite"),
+    ],
+)
+def test_one_bad_program_fails_alone(spoil: str, words: str) -> None:
+    horizon = mixed(4)
+    rows = [
+        replace(b, jac=b.jac.copy(), lower=None if b.lower is None else b.lower.copy()) for b in horizon.rows
+    ]
+    bad = replace(
+        horizon, initial=horizon.initial.copy(), reference=horizon.reference.copy(), rows=tuple(rows)
+    )
+    at = (1, 0)
+    arrays = {
+        "initial": (bad.initial, np.nan), "reference": (bad.reference, np.inf), "jac": (rows[3].jac, np.nan),
+        "bound": (rows[1].lower, np.nan), "crossed": (rows[5].lower, 1e9), "negative": (rows[1].w2, -5.0),
+        "infinite": (rows[0].w1, np.inf),
+    }  # fmt: skip
+    array, value = arrays[spoil]
+    assert array is not None
+    array[at].flat[-1] = value
+    solver = make_batch_solver("kernel")
+    result = solver.solve_batch(bad)
+    assert result.status[at] == CODE[QpStatus.FAILED]
+    assert list(result.messages) == [at]
+    assert "not shown to the solver" in result.messages[at]
+    assert np.isnan(result.z[at]).all()
+    np.testing.assert_array_equal(np.argwhere(result.status != SOLVED), [at])
+    with pytest.raises(AssertionError, match=words):
+        raise AssertionError(result.messages[at])
+
+
+def test_masked_runs_are_skipped_whatever_they_hold() -> None:
+    horizon = mixed(3, 4, 2)
+    whole = make_batch_solver("kernel").solve_batch(horizon)
+    active = np.array([True, False, True, False])
+    horizon.initial[1] = np.nan
+    result = make_batch_solver("kernel").solve_batch(horizon, active=active)
+    assert (result.status[~active] == CODE[QpStatus.SKIPPED]).all()
+    assert np.isnan(result.z[~active]).all()
+    assert not result.messages
+    np.testing.assert_array_equal(result.z[active], whole.z[active])
+    with pytest.raises(QpError, match="active has shape"):
+        make_batch_solver("kernel").solve_batch(horizon, active=np.ones(3, dtype=bool))
+    with pytest.raises(QpError, match="warm start has shapes"):
+        make_batch_solver("kernel").solve_batch(horizon, WarmStart(np.zeros((2, 2, 3)), np.zeros((2, 2, 3))))
+
+
+def test_empty_batch() -> None:
+    result = make_batch_solver("kernel").solve_batch(mixed(0, 0, 2))
+    assert result.states.shape == (0, 2, len(GRID), 12)
+
+
+# --- The kernel itself ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("yaw_rad", [0.0, 0.7])
+def test_signal_kernel_is_what_a_force_does(yaw_rad: float) -> None:
+    model = hover_model(GRID, yaw_rad)
+    maps = signal_maps(model)
+    n = model.stages
+    oracle = Oracle(HorizonQp(model, np.zeros((1, 1, 12)), np.zeros((1, 1, n, 12)), ()), 0, 0)
+    signals = np.zeros((len(maps.stage), 4 * n))
+    for i, (k, target) in enumerate(zip(maps.stage, maps.target, strict=True)):
+        signals[i] = oracle.moved[k, target] if target < 12 else np.eye(4 * n)[4 * k + target - 12]
+    expected = signals @ np.linalg.solve(oracle.hessian, signals.T)
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(maps.kernel / size / size[:, None], expected / size / size[:, None], atol=1e-7)
+    # Four chains at zero yaw; turned, the horizontal ones are one.
+    chains = len(set(zip(maps.begin.tolist(), maps.end.tolist(), strict=True)))
+    assert chains == (4 if yaw_rad == 0.0 else 3)
