@@ -602,7 +602,7 @@ class Planner(_Section):
     """Least synchronised reference speed over V_r."""
     max_speed_ratio: float = Field(1.5, ge=1.0, le=10.0)
     """Largest commanded speed over V_r."""
-    solver: str = Field("osqp", min_length=1, max_length=50)
+    solver: str = Field("kernel", min_length=1, max_length=50)
     """QP planner: name of the solver."""
     horizon: int = Field(20, ge=2, le=100)
     """QP planner: stages N of the horizon; the first have the planner's period, later ones grow."""
