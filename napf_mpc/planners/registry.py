@@ -5,12 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from napf_mpc.errors import ProblemError
+from napf_mpc.planners.guided_field import GuidedNapfPlanner
 from napf_mpc.planners.planner import Planner
 from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner
 from napf_mpc.problem import Problem
 from napf_mpc.words import did_you_mean, shown_text
 
-PLANNERS: dict[str, Callable[[Problem], Planner]] = {"apf": ApfPlanner, "napf": NapfPlanner}
+PLANNERS: dict[str, Callable[[Problem], Planner]] = {
+    "apf": ApfPlanner,
+    "napf": NapfPlanner,
+    "napf_guided": GuidedNapfPlanner,
+}
 """Name -> factory."""
 ANNOUNCED = ("qp",)
 """Names that problem files may hold, but that this version cannot fly."""
