@@ -586,7 +586,7 @@ Navigation = Annotated[GaussMarkov | ConstantBias | Recorded, Field(discriminato
 class Planner(_Section):
     """The planner and its potential field (Eq. 23-39, section 3.2)."""
 
-    kind: Literal["apf", "napf", "qp"] = "napf"
+    kind: Literal["apf", "napf", "napf_guided", "qp", "qp_unguided"] = "napf"
     """Planner that ``run`` flies unless told otherwise."""
     rate_hz: float = Field(10.0, ge=0.5, le=100.0)
     """Rate at which the planner is asked."""
@@ -602,6 +602,8 @@ class Planner(_Section):
     """Least synchronised reference speed over V_r."""
     max_speed_ratio: float = Field(1.5, ge=1.0, le=10.0)
     """Largest commanded speed over V_r."""
+    guidance: Literal["none", "blended"] = "blended"
+    """QP planner: whether references bend around what the formation cannot pass."""
     solver: str = Field("kernel", min_length=1, max_length=50)
     """QP planner: name of the solver."""
     horizon: int = Field(20, ge=2, le=100)
@@ -679,7 +681,9 @@ class Reference(_Section):
     """Where they were published."""
     runs: int = Field(ge=1, le=1_000_000_000)
     """Runs behind them."""
-    collision_risk: dict[Literal["apf", "napf", "qp"], Annotated[float, Field(ge=0.0, le=1.0)]]
+    collision_risk: dict[
+        Literal["apf", "napf", "napf_guided", "qp", "qp_unguided"], Annotated[float, Field(ge=0.0, le=1.0)]
+    ]
     """Planner -> published collision risk."""
     note: str = Field("", max_length=1000)
     """What may and may not be concluded."""

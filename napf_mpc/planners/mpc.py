@@ -15,7 +15,8 @@ from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
-from napf_mpc.planners.guide import Guide
+from napf_mpc.planners.guidance import Guidance
+from napf_mpc.planners.guided_field import waiting_reasons
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
 from napf_mpc.planners.planner import Command, Reason
 from napf_mpc.planners.references import SlotReference
@@ -23,7 +24,7 @@ from napf_mpc.planners.tally import COUNTED, FALL_BACKS, Tally
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem import Planner as Settings
 from napf_mpc.qp import STATES, HorizonQp
-from napf_mpc.safety_distance import rms_sigma
+from napf_mpc.safety_distance import Inflation, rms_sigma
 from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
 from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
@@ -85,6 +86,8 @@ class QpPlanner:
         A solver, or the name of one, instead of the problem's.
     name : str
         Name in tables and files.
+    guided : bool, optional
+        Whether the references follow formation guidance, instead of what the problem says.
     clock : callable, optional
         Seconds that go on while the solver works. With one, answers that take longer than the planner's
         period are refused as late; without, as in all simulations, time stands still meanwhile.
@@ -96,6 +99,7 @@ class QpPlanner:
         constraints: Sequence[Constraint] | None = None,
         solver: str | BatchSolver | None = None,
         name: str = "qp",
+        guided: bool | None = None,
         clock: Callable[[], float] | None = None,
     ) -> None:
         if not isinstance(problem.mission, FormationMission):
@@ -107,6 +111,8 @@ class QpPlanner:
         self._clock = clock
         self._frame = PathFrame.of_mission(problem.mission)
         self._slots = SlotReference.of_problem(problem, problem.mission)
+        follows = settings.guidance == "blended" if guided is None else guided
+        self._guidance = Guidance(problem, Inflation.of_problem(problem)) if follows else None
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
         self._period_s = 1.0 / settings.rate_hz
         step = stage_grid(self._period_s, settings.horizon, settings.look_ahead_s)
@@ -134,6 +140,8 @@ class QpPlanner:
         self._answer: BatchResult | None = None
         self._made_s: Array = np.full((runs, uavs), -np.inf)
         self._anchor: Array = np.repeat(self._lanes[None], runs, axis=0)
+        if self._guidance is not None:
+            self._guidance.reset(obstacles, runs)
         self.ladder = Ladder(runs, uavs)
         self.tally = Tally.none(runs)
 
@@ -151,9 +159,11 @@ class QpPlanner:
         trusted = nav.trusted() & airborne
         self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
         state = self._state(nav, trusted)
-        reference = self._slots.over(
-            state[..., POSITION], self._model.times_s, _sigma(nav, trusted), self._guide(nav, trusted)
-        )
+        covariance = np.where(trusted[..., None, None], nav.position_covariance, np.eye(3))
+        guide = None
+        if self._guidance is not None:
+            guide = self._guidance.step(state[..., POSITION], covariance, trusted, time_s)
+        reference = self._slots.over(state[..., POSITION], self._model.times_s, _sigma(nav, trusted), guide)
         began = 0.0 if self._clock is None else self._clock()
         answer = self._solve(state, reference, nav, trusted, time_s)
         late = self._clock is not None and not self._clock() - began <= self._period_s
@@ -168,22 +178,22 @@ class QpPlanner:
         on_plan = action <= Action.TAIL
         down = np.where(action == Action.DESCEND, -DESCENT_MPS, 0.0)[..., None] * self._frame.up
         planned = on_plan[..., None]
+        reason = _reasons(action, trusted)
+        if guide is not None:
+            reason = np.maximum(reason, waiting_reasons(guide))
         return Command(
             position=np.where(planned, flown.initial[..., POSITION], self._anchor),
             velocity=np.where(planned, flown.initial[..., VELOCITY], down),
             direction=np.where(planned, 0.0, down),
             yaw=np.full(trusted.shape, self._yaw),
-            holding=~on_plan,
+            holding=reason > Reason.NONE,
             feedforward=np.zeros((*trusted.shape, 4)),
             plan=flown,
             planned=on_plan,
-            reason=_reasons(action, trusted),
+            reason=reason,
             slack_m=self._contact_slack(answer, accepted),
             solver_status=_WORDS[answer.status],
         )
-
-    def _guide(self, nav: NavSolution, trusted: Mask) -> Guide | None:
-        return None
 
     def _state(self, nav: NavSolution, trusted: Mask) -> Array:
         """State (run, uav, 12) as reported; a UAV that is not trusted stands at its last known place."""

@@ -66,16 +66,7 @@ class PotentialFieldPlanner:
         """Command of all UAVs from the reported solution and the map."""
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
-        trusted = nav.trusted()
-        self._move_anchors(nav, trusted)
-        if trusted.all():
-            position, covariance = nav.position, nav.position_covariance
-        else:
-            # What is not trusted must not reach the arithmetic, where NaN would spread to all UAVs by u_c.
-            # The others keep formation with the place where such a UAV holds.
-            position = self._anchor
-            covariance = np.where(trusted[..., None, None], nav.position_covariance, np.eye(3))
-
+        position, covariance, trusted = self._estimates(nav)
         error = synchronisation_error(self._frame.along_track(position), self._offsets[:, 0])
         speed = reference_speed(
             mission.speed_mps,
@@ -99,7 +90,18 @@ class PotentialFieldPlanner:
             holding=~trusted,
             feedforward=np.zeros((*trusted.shape, 4)),
         )
-        return self._hold(command)
+        return self._hold(command, trusted)
+
+    def _estimates(self, nav: NavSolution) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Positions, their covariances and which of them are trusted; every number finite."""
+        trusted = nav.trusted()
+        self._move_anchors(nav, trusted)
+        if trusted.all():
+            return nav.position, nav.position_covariance, trusted
+        # What is not trusted must not reach the arithmetic, where NaN would spread to all UAVs by u_c.
+        # The others keep formation with the place where such a UAV holds.
+        covariance = np.where(trusted[..., None, None], nav.position_covariance, np.eye(3))
+        return self._anchor, covariance, trusted
 
     def _repulsion(self, position: Array, covariance: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Force on each UAV (run, uav, 3), and whether any obstacle is within its range (run, uav)."""
@@ -121,11 +123,11 @@ class PotentialFieldPlanner:
         self._anchor = np.where(known[..., None], nav.position, self._anchor)
         self._placed |= known
 
-    def _hold(self, command: Command) -> Command:
+    def _hold(self, command: Command, trusted: NDArray[np.bool_]) -> Command:
         """Hover at the last trusted place where navigation is not to be trusted: never "no obstacle"."""
-        if not command.holding.any():
+        if trusted.all():
             return command
-        lost = command.holding[..., None]
+        lost = ~trusted[..., None]
         return replace(
             command,
             position=np.where(lost, self._anchor, command.position),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from napf_mpc.errors import ProblemError
+from napf_mpc.planners.guided_field import GuidedNapfPlanner
 from napf_mpc.planners.planner import Planner
 from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner
 from napf_mpc.problem import Problem
@@ -17,7 +18,19 @@ def _qp(problem: Problem) -> Planner:
     return QpPlanner(problem)
 
 
-PLANNERS: dict[str, Callable[[Problem], Planner]] = {"apf": ApfPlanner, "napf": NapfPlanner, "qp": _qp}
+def _qp_unguided(problem: Problem) -> Planner:
+    from napf_mpc.planners.mpc import QpPlanner
+
+    return QpPlanner(problem, name="qp_unguided", guided=False)
+
+
+PLANNERS: dict[str, Callable[[Problem], Planner]] = {
+    "apf": ApfPlanner,
+    "napf": NapfPlanner,
+    "napf_guided": GuidedNapfPlanner,
+    "qp": _qp,
+    "qp_unguided": _qp_unguided,
+}
 """Name -> factory."""
 
 

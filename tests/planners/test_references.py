@@ -57,7 +57,7 @@ def bend(pace: float = 1.0) -> Guide:
     ahead = np.arange(0.0, 21.0)
     offset = np.zeros((1, 2, 21, 2))
     offset[0, 0, :, 0] = np.clip(0.5 * (ahead - 2.0), 0.0, 3.0)
-    return Guide(ahead, offset, np.full((1, 2), pace), np.zeros((1, 2), dtype=np.int8))
+    return Guide(ahead, offset, np.full((1, 2), pace), np.zeros((1, 2), dtype=np.int8), np.zeros((1, 2)))
 
 
 def test_a_guide_bends_the_lane_and_the_velocity_with_it() -> None:

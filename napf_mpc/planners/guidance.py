@@ -1,0 +1,218 @@
+"""Guidance of a formation: how the virtual structure's own path bends around what its members cannot pass.
+
+Every UAV has a lane; guidance tells it by how much to leave the lane over the next tens of metres, and how
+fast to go. It sees what a planner sees, estimates and the map, and keeps the radius and k sigma from every
+obstacle, with a little to spare. What cannot be passed with that margin is not squeezed through: the
+formation slows, holds in front of it, and if the hold lasts too long, gives up with the reason "no passage".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.errors import ProblemError
+from napf_mpc.formation import PathFrame, formation_offsets, synchronisation_error
+from napf_mpc.planners.guide import Guide, Passage
+from napf_mpc.planners.guide_clearance import SolidBoxes, frame_of, solid_boxes
+from napf_mpc.planners.guide_search import plan_all, resample_all
+from napf_mpc.planners.guide_settings import FINE, GuidanceSettings, search_of
+from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.safety_distance import Inflation, largest_sigma, rms_sigma
+from napf_mpc.world.obstacles import ObstacleSet
+
+Array = NDArray[np.float64]
+
+
+class Guidance:
+    """Plans the guide of all runs and remembers what has been decided.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation mission, sizes and speeds.
+    inflation : Inflation
+        Its k and its reading of sigma; guidance always takes k sigma as distance.
+    settings : GuidanceSettings, optional
+        Weights and limits.
+    """
+
+    def __init__(
+        self, problem: Problem, inflation: Inflation, settings: GuidanceSettings | None = None
+    ) -> None:
+        if not isinstance(problem.mission, FormationMission):
+            raise ProblemError("mission.kind", ['must be "formation" for guidance, not "goal"'])
+        self.settings = settings or GuidanceSettings()
+        self._inflation = inflation
+        self._path = PathFrame.of_mission(problem.mission)
+        self._frame = frame_of(self._path)
+        self._slots = formation_offsets(problem.formation)
+        self._lanes = np.ascontiguousarray(self._slots[:, 1:])
+        self._min_separation = problem.vehicle.min_separation_m
+        self._search = search_of(self.settings, inflation.k, problem.vehicle.radius_m)
+        stations = (self._search.lattice.stations - 1) * FINE + 1
+        self._step_m = self._search.lattice.step_m / FINE
+        self.ahead_m: Array = self._step_m * np.arange(stations, dtype=np.float64)
+        gap = self._slots[:, None] - self._slots[None]
+        self._slot_distance = np.sqrt(gap[..., 0] ** 2 + gap[..., 1] ** 2 + gap[..., 2] ** 2)
+        self.reset(ObstacleSet.empty(), 0)
+
+    def reset(self, obstacles: ObstacleSet, runs: int) -> None:
+        """Take a new map and forget all plans."""
+        if runs:
+            obstacles.check_runs(runs)
+        uavs, stations = len(self._lanes), len(self.ahead_m)
+        self._obstacles = obstacles
+        self._boxes: SolidBoxes = solid_boxes(obstacles, self._path)
+        self._profiles = np.zeros((runs, uavs, stations, 2))
+        self._missing = np.zeros((runs, uavs, stations))
+        self._busy = np.zeros(runs, dtype=bool)
+        self._planned_at = np.zeros((runs, uavs))
+        self._position = np.repeat(self._path.to_world(self._slots)[None], runs, axis=0)
+        self._covariance = np.tile(np.eye(3), (runs, uavs, 1, 1))
+        self._peak: Array = np.zeros((runs, uavs, 3))
+        self._next_s = -np.inf
+        self._last_s = np.nan
+        self._holding = np.zeros(runs, dtype=bool)
+        self._held_s = np.zeros(runs)
+        self._stuck = np.zeros(runs, dtype=bool)
+        self._squeezing = np.zeros(runs, dtype=bool)
+        self._given_up = np.zeros(runs, dtype=bool)
+        self._pace = np.ones(runs)
+
+    def step(self, position: Array, covariance: Array, trusted: NDArray[np.bool_], time_s: float) -> Guide:
+        """Guide from what navigation reports; plans anew when its period has passed.
+
+        Parameters
+        ----------
+        position : array, shape (run, uav, 3)
+            Estimates [m].
+        covariance : array, shape (run, uav, 3, 3)
+            Of the position [m^2].
+        trusted : array of bool, shape (run, uav)
+            Where the estimate may be used; elsewhere the last trusted one is.
+        time_s : float
+            Time since the start [s].
+
+        Returns
+        -------
+        Guide
+            Offsets from where each UAV is now.
+        """
+        self._position = np.where(trusted[..., None], position, self._position)
+        self._covariance = np.where(trusted[..., None, None], covariance, self._covariance)
+        place = self._path.to_path(self._position)
+        along = np.ascontiguousarray(place[..., 0])
+        if time_s >= self._next_s - 1e-9:
+            elapsed = 0.0 if np.isnan(self._last_s) else time_s - self._last_s
+            self._plan(place, elapsed)
+            self._last_s = time_s
+            self._next_s = time_s + self.settings.period_s
+        return self._guide(along, self._from(along))
+
+    def _from(self, along: Array) -> Array:
+        """Profiles (run, uav, station, 2) as seen from along-track places (run, uav)."""
+        out = np.empty_like(self._profiles)
+        resample_all(self._profiles, along - self._planned_at, self._step_m, out)
+        return out
+
+    def _plan(self, place: Array, elapsed_s: float) -> None:
+        # Stations stand still in the world: a gap must not open and close with where the samples fall.
+        step = self.settings.step_m
+        along = np.floor(place[..., 0] / step) * step
+        last = self._from(along)
+        offset = np.ascontiguousarray(place[..., 1:]) - self._lanes
+        margin = self._margin_covariance(elapsed_s)
+        plan_all(
+            self._obstacles.solids,
+            self._boxes,
+            self._obstacles.scene_start,
+            self._frame,
+            ~self._given_up,
+            along,
+            offset,
+            self._lanes,
+            margin,
+            self._separation(margin),
+            last,
+            self._stuck,
+            self._search,
+            self._profiles,
+            self._missing,
+            self._busy,
+        )
+        self._planned_at = along
+        self._hold(offset, elapsed_s)
+
+    def _margin_covariance(self, elapsed_s: float) -> Array:
+        """Covariance (run, uav, 3, 3) whose k sigma is the margin, as the inflation reads it."""
+        covariance = self._covariance
+        if self._inflation.reading in ("largest", "rms"):
+            one = largest_sigma(covariance) if self._inflation.reading == "largest" else rms_sigma(covariance)
+            covariance = np.asarray((one**2)[..., None, None] * np.eye(3))
+        if self.settings.memory_s <= 0.0:
+            return np.ascontiguousarray(covariance)
+        sigma = np.sqrt(np.einsum("...ii->...i", covariance))
+        self._peak = np.maximum(sigma, self._peak * np.exp(-elapsed_s / self.settings.memory_s))
+        grown = self._peak / np.maximum(sigma, 1e-12)
+        return np.asarray(covariance * grown[..., :, None] * grown[..., None, :])
+
+    def _separation(self, covariance: Array) -> Array:
+        """Distances (run, uav, uav) to keep between UAVs: k sigma of both, as far as slots allow."""
+        variance = rms_sigma(covariance) ** 2
+        wanted = self._min_separation + self._inflation.k * np.sqrt(variance[:, :, None] + variance[:, None])
+        return np.minimum(wanted, self.settings.apart_share * self._slot_distance)
+
+    def _hold(self, offset: Array, elapsed_s: float) -> None:
+        """Decide per run how fast to go on, from what is blocked ahead and how near it is."""
+        settings = self.settings
+        breach = np.maximum(self._missing - settings.spare_m, 0.0)
+        # Where a UAV is already inside the margin, a way that gets no worse leads out.
+        here = np.maximum(breach[..., 0], breach[..., 1])
+        worse = breach - here[..., None]
+        distance = self._blocked_at(worse, settings.tolerance_m)
+        self._squeezing &= distance <= settings.stop_m + settings.slow_m
+        self._squeezing |= self._held_s >= settings.squeeze_after_s
+        distance = np.where(
+            self._squeezing, self._blocked_at(worse, max(settings.tolerance_m, settings.squeeze_m)), distance
+        )
+        release = np.where(self._holding, settings.release_m, 0.0)
+        astray = np.abs(self._profiles[:, :, 0] - offset).max((-1, -2)) > settings.aside_m
+        self._holding = (distance <= settings.stop_m + release) | (self._stuck & astray)
+        self._pace = np.clip((distance - settings.stop_m) / settings.slow_m, 0.2, 1.0)
+        self._pace = np.minimum(self._pace, self._slope_pace())
+        self._held_s = np.where(
+            self._holding, self._held_s + elapsed_s, np.maximum(0.0, self._held_s - elapsed_s)
+        )
+        self._stuck = self._holding & (self._stuck | (self._held_s >= settings.aside_after_s))
+        self._given_up |= self._held_s >= settings.hold_limit_s
+
+    def _slope_pace(self) -> Array:
+        """Factor (run,) on the speed at which the steepest piece just ahead can be flown."""
+        stations = max(2, round(self.settings.bend_m / self._step_m) + 1)
+        step = np.diff(self._profiles[:, :, :stations], axis=2) / self._step_m
+        slope = np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2).max((-1, -2))
+        return np.asarray(np.clip(self.settings.flown_slope / np.maximum(slope, 1e-9), 0.3, 1.0))
+
+    def _blocked_at(self, breach: Array, tolerance_m: float) -> Array:
+        """Distance ahead (run,) at which the first UAV's breach (run, uav, station) exceeds a tolerance."""
+        return np.asarray(np.where(breach > tolerance_m, self.ahead_m, np.inf).min((-1, -2)))
+
+    def _guide(self, along: Array, offset: Array) -> Guide:
+        settings = self.settings
+        sigma = np.sqrt(np.maximum(np.einsum("ruab,a,b->ru", self._covariance, *[self._path.along] * 2), 0.0))
+        error = synchronisation_error(along, self._slots[:, 0])
+        behind = -error - settings.left_behind_m - 2.0 * sigma
+        worst = behind.max(-1, keepdims=True)
+        wait = np.where((worst > 0.0) & (error > 0.0), np.clip(1.0 - 0.25 * worst, 0.2, 1.0), 1.0)
+        stopped = (self._holding | self._given_up)[:, None]
+        pace = np.where(stopped, 0.0, np.minimum(wait, self._pace[:, None]))
+        reason = np.full(along.shape, Passage.NONE, dtype=np.int8)
+        size = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2).max(-1)
+        reason[size > 0.5] = Passage.DETOUR
+        reason[wait < 1.0] = Passage.WAIT
+        reason[self._squeezing] = Passage.SQUEEZE
+        reason[self._holding] = Passage.HOLD
+        reason[self._given_up] = Passage.NO_PASSAGE
+        breach = np.maximum(self._missing.max(-1, initial=0.0) - settings.spare_m, 0.0)
+        return Guide(self.ahead_m, offset, pace, reason, breach)

@@ -1,0 +1,373 @@
+"""Profiles of a whole formation: each UAV's own way blended with one for all (one run, compiled).
+
+Two drafts are made on the lattice: every UAV for itself, drawn to the mean of what the others flew last, and
+all with one profile. Both are smoothed together, where the mean is what the UAVs really do, and the cheaper
+one is kept: a lone obstacle moves one UAV, a wall moves all.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.jit import compiled
+from napf_mpc.planners.guide_band import (
+    WIDTH,
+    add_neighbour,
+    add_row,
+    add_solids,
+    band_price,
+    exact_missing,
+    smooth_terms,
+    solve_band,
+)
+from napf_mpc.planners.guide_clearance import Frame, SolidBoxes, gather, largest_reach, vertical_room
+from napf_mpc.planners.guide_lattice import (
+    Lattice,
+    Prices,
+    cheapest_profile,
+    fill_missing,
+    node_neighbour,
+    node_prices,
+)
+from napf_mpc.world.distance import Solids
+
+Array = NDArray[np.float64]
+
+PUSH = 500.0
+"""Price of a squared shortfall in the band [1/m^2]: what is left of it is a few centimetres."""
+TIGHT_M = 10.0
+"""A profile starts where the UAV is if something is in the way over this distance."""
+AWAY_M = 0.5
+"""A UAV whose lane is free, and whose last profile was this near to it, needs no search."""
+MOST_SOLIDS = 512
+"""Solids that one UAV's look-ahead takes into account."""
+
+
+class Search(NamedTuple):
+    """Settings of the search."""
+
+    lattice: Lattice
+    wide: Lattice  # coarser and farther to the sides, for large margins
+    wide_m: float  # radius and margin from which that is used
+    prices: Prices
+    k: float
+    radius_m: float
+    passes: int
+    pass_m: float  # largest step of a pass [m]
+    shared_gain: float  # the common draft must be cheaper by this factor
+
+
+@compiled
+def resample(profile: Array, shift_m: float, step_m: float, out: Array) -> None:
+    """Profile (station, 2) as seen ``shift_m`` farther along; its ends go on beyond."""
+    stations = profile.shape[0]
+    for s in range(stations):
+        at = min(max(s + shift_m / step_m, 0.0), stations - 1.0)
+        lower = min(int(at), stations - 2)
+        part = at - lower
+        for a in range(2):
+            out[s, a] = (1.0 - part) * profile[lower, a] + part * profile[lower + 1, a]
+
+
+@compiled
+def mean_profile(profiles: Array, mean: Array) -> None:
+    """Mean (station, 2) over UAVs of profiles (uav, station, 2), in place."""
+    uavs = profiles.shape[0]
+    for s in range(profiles.shape[1]):
+        for a in range(2):
+            total = 0.0
+            for i in range(uavs):
+                total += profiles[i, s, a]
+            mean[s, a] = total / uavs
+
+
+@compiled
+def _refine(coarse: Array, every: int, fine: Array) -> None:
+    for s in range(fine.shape[0]):
+        lower = min(s // every, coarse.shape[0] - 2)
+        part = s / every - lower
+        for a in range(2):
+            fine[s, a] = (1.0 - part) * coarse[lower, a] + part * coarse[lower + 1, a]
+
+
+@compiled
+def _tight(short: Array, offset: Array, last: Array, lattice: Lattice, below: int) -> bool:
+    """Whether something is short over the next metres between the UAV, its lane and its last profile."""
+    layer = min(max(round(offset[1] / lattice.layer_m) + below, 0), short.shape[2] - 1)
+    low = min(offset[0], min(last[0], 0.0)) - 1.0
+    high = max(offset[0], max(last[0], 0.0)) + 1.0
+    c0 = max(0, int(np.floor(low / lattice.cell_m)) + lattice.half)
+    c1 = min(2 * lattice.half, int(np.ceil(high / lattice.cell_m)) + lattice.half)
+    for s in range(int(np.ceil(TIGHT_M / lattice.step_m))):
+        for c in range(c0, c1 + 1):
+            if short[s, c, layer] > 0.0:
+                return True
+    return False
+
+
+@compiled
+def plan_run(
+    solids: Solids,
+    boxes: SolidBoxes,
+    first: int,
+    stop: int,
+    frame: Frame,
+    along: Array,
+    offset: Array,
+    lanes: Array,
+    covariance: Array,
+    separation: Array,
+    last: Array,
+    stuck: bool,
+    search: Search,
+    profiles: Array,
+    missing: Array,
+) -> bool:
+    """Plan the profiles of one run's UAVs.
+
+    Parameters
+    ----------
+    solids, boxes, first, stop
+        The scene: solids ``first`` to ``stop - 1``.
+    frame : Frame
+        The path's frame.
+    along, offset : array, shape (uav,), (uav, 2)
+        Where UAVs are: along the path, left and up of their lanes [m].
+    lanes : array, shape (uav, 2)
+        Lanes: left and up [m].
+    covariance : array, shape (uav, 3, 3)
+        Of the position [m^2].
+    separation : array, shape (uav, uav)
+        Distances to keep between UAVs [m].
+    last : array, shape (uav, station, 2)
+        Last profiles, from where the UAVs are now [m].
+    stuck : bool
+        Whether the formation stands before something: then UAVs may also go aside on the spot.
+    search : Search
+        Settings.
+    profiles, missing : array, shape (uav, station, 2), (uav, station)
+        Written: profiles, and their shortfalls [m].
+
+    Returns
+    -------
+    bool
+        Whether anything was in the way of the lanes or of the last profiles.
+    """
+    prices = search.prices
+    aside = prices.aside if stuck else -1.0
+    uavs, fine, _ = profiles.shape
+    need = search.radius_m + prices.spare_m
+    lattice = search.lattice
+    for i in range(uavs):
+        if largest_reach(covariance[i], search.k, need) > search.wide_m:
+            lattice = search.wide
+    step = lattice.step_m / lattice.fine
+    span = lattice.half * lattice.cell_m
+    ahead = (lattice.stations - 1) * lattice.step_m
+    found = np.empty((uavs, MOST_SOLIDS), dtype=np.int64)
+    count = np.empty(uavs, dtype=np.int64)
+    reach = np.empty(uavs)
+    upwards = False
+    downwards = True
+    for i in range(uavs):
+        reach[i] = largest_reach(covariance[i], search.k, need)
+        count[i] = gather(
+            boxes, first, stop, along[i] - 1.0, along[i] + ahead, lanes[i, 0] - span, lanes[i, 0] + span,
+            reach[i], found[i],
+        )  # fmt: skip
+        up, down = vertical_room(
+            solids, boxes, found[i], count[i], lanes[i, 1], reach[i], lattice.layers * lattice.layer_m
+        )
+        upwards = upwards or up
+        downwards = downwards and (down or count[i] == 0)
+    downwards = downwards and upwards
+    below = lattice.sphere_layers // 2 if downwards else 0
+    layers = 1
+    if upwards:
+        layers += 2 * below if downwards else lattice.layers
+    cells = 2 * lattice.half + 1
+    zero = np.zeros((fine, 2))
+    mean = np.empty((fine, 2))
+    short = np.zeros((uavs, lattice.stations, cells, layers))
+    in_the_way = 0
+    moved = False
+    is_short = np.zeros(uavs, dtype=np.bool_)
+    tight = np.zeros(uavs, dtype=np.bool_)
+    away = np.zeros(uavs, dtype=np.bool_)
+    for i in range(uavs):
+        for s in range(fine):
+            moved = moved or abs(last[i, s, 0]) > 1e-3 or abs(last[i, s, 1]) > 1e-3
+    for i in range(uavs):
+        if count[i] == 0:
+            continue
+        is_short[i] = fill_missing(
+            solids, boxes, found[i], count[i], frame, along[i], lanes[i], covariance[i], search.k, need,
+            reach[i], lattice, below, short[i],
+        )  # fmt: skip
+        if is_short[i]:
+            blocked = False
+            for s in range(lattice.stations):
+                blocked = blocked or short[i, s, lattice.half, below] > 0.0
+            in_the_way += blocked
+            away[i] = blocked
+            for s in range(fine):
+                away[i] = away[i] or abs(last[i, s, 0]) > AWAY_M or abs(last[i, s, 1]) > AWAY_M
+            tight[i] = _tight(short[i], offset[i], last[i, 0], lattice, below)
+    if in_the_way == 0 and not moved:
+        profiles[:] = 0.0
+        missing[:] = 0.0
+        return False
+    node = np.empty((lattice.stations, cells, layers))
+    value = np.empty((2, cells, layers))
+    back = np.empty((lattice.stations, cells, layers), dtype=np.int8)
+    coarse = np.zeros((uavs, lattice.stations, 2))
+    mean_profile(last, mean)
+    draft_mean = np.empty((fine, 2))
+    start = offset.copy()
+    best = np.inf
+    trial = np.empty((uavs, fine, 2))
+    drafts = np.empty((uavs, fine, 2))
+    trial_missing = np.empty((uavs, fine))
+    matrix = np.empty((2 * fine, WIDTH))
+    right = np.empty(2 * fine)
+    for draft in range(2):
+        draft_mean[:] = mean
+        if draft == 1:
+            if in_the_way < 2:
+                break
+            node[:] = 0.0
+            middle = np.zeros(2)
+            for i in range(uavs):
+                node_prices(short[i], 1.0, zero, last[i], 0.0, lattice, below, prices, node)
+                middle += offset[i] / uavs
+            _search(node, middle, lattice, below, prices, float(uavs), aside, value, back, coarse[0])
+            _refine(coarse[0], lattice.fine, draft_mean)
+        for i in range(uavs):
+            if away[i]:
+                node[:] = 0.0
+                node_prices(short[i], 1.0, draft_mean, last[i], prices.shape, lattice, below, prices, node)
+                for j in range(i):
+                    node_neighbour(
+                        along[i] - along[j], lanes[i] - lanes[j], separation[i, j], coarse[j], lattice,
+                        below, prices.apart, node,
+                    )  # fmt: skip
+                _search(node, offset[i], lattice, below, prices, 1.0, aside, value, back, coarse[i])
+                _refine(coarse[i], lattice.fine, trial[i])
+                for a in range(2):
+                    start[i, a] = offset[i, a]
+                    if stuck and abs(coarse[i, 0, a] - offset[i, a]) > lattice.cell_m:
+                        start[i, a] = coarse[i, 0, a]
+            else:
+                coarse[i] = 0.0
+                trial[i] = 0.0
+        drafts[:] = trial
+        for _ in range(search.passes):
+            mean_profile(trial, draft_mean)
+            for i in range(uavs):
+                smooth_terms(trial[i], draft_mean, last[i], step, prices, matrix, right)
+                if tight[i]:
+                    add_row(matrix, right, 0, prices.start, 1.0, 0.0, start[i, 0])
+                    add_row(matrix, right, 0, prices.start, 0.0, 1.0, start[i, 1])
+                if is_short[i]:
+                    add_solids(
+                        solids, boxes, found[i], count[i], frame, along[i], lanes[i], covariance[i], search.k,
+                        need, reach[i], step, PUSH, drafts[i], trial[i], matrix, right,
+                    )  # fmt: skip
+                for j in range(uavs):
+                    if j != i and abs(along[i] - along[j]) < separation[i, j]:
+                        add_neighbour(
+                            along[i] - along[j], lanes[i] - lanes[j], separation[i, j], trial[j], step,
+                            prices.apart, trial[i], matrix, right,
+                        )  # fmt: skip
+                solve_band(matrix, right, 2 * fine)
+                for s in range(fine):
+                    for a in range(2):
+                        # A longer step could jump across what the draft goes round.
+                        change = right[2 * s + a] - trial[i, s, a]
+                        trial[i, s, a] += min(max(change, -search.pass_m), search.pass_m)
+        for i in range(uavs):
+            exact_missing(
+                solids, boxes, found[i], count[i], frame, along[i], lanes[i], covariance[i], search.k, need,
+                reach[i], step, trial[i], trial_missing[i],
+            )  # fmt: skip
+        mean_profile(trial, draft_mean)
+        price = band_price(trial, draft_mean, last, trial_missing, step, prices)
+        if draft == 0 or price < search.shared_gain * best:
+            best = price
+            profiles[:] = trial
+            missing[:] = trial_missing
+    return True
+
+
+@compiled
+def _search(
+    node: Array,
+    offset: Array,
+    lattice: Lattice,
+    below: int,
+    prices: Prices,
+    weight: float,
+    aside: float,
+    value: Array,
+    back: NDArray[np.int8],
+    out: Array,
+) -> None:
+    """Cheapest profile from where a UAV is, or the nearest place that the lattice knows."""
+    cell = round(offset[0] / lattice.cell_m) + lattice.half
+    layer = round(offset[1] / lattice.layer_m) + below
+    cell = min(max(cell, 0), node.shape[1] - 1)
+    layer = min(max(layer, 0), node.shape[2] - 1)
+    cheapest_profile(
+        node,
+        cell,
+        layer,
+        lattice,
+        below,
+        weight * prices.slope,
+        prices.steep,
+        weight * aside,
+        value,
+        back,
+        out,
+    )
+
+
+@compiled
+def plan_all(
+    solids: Solids,
+    boxes: SolidBoxes,
+    scene_start: NDArray[np.int64],
+    frame: Frame,
+    due: NDArray[np.bool_],
+    along: Array,
+    offset: Array,
+    lanes: Array,
+    covariance: Array,
+    separation: Array,
+    last: Array,
+    stuck: NDArray[np.bool_],
+    search: Search,
+    profiles: Array,
+    missing: Array,
+    busy: NDArray[np.bool_],
+) -> None:
+    """Plan all runs that are due, each from its own scene and state alone."""
+    for r in range(along.shape[0]):
+        if not due[r]:
+            continue
+        scene = 0 if len(scene_start) == 2 else r
+        busy[r] = plan_run(
+            solids, boxes, scene_start[scene], scene_start[scene + 1], frame, along[r], offset[r], lanes,
+            covariance[r], separation[r], last[r], stuck[r], search, profiles[r], missing[r],
+        )  # fmt: skip
+
+
+@compiled
+def resample_all(profiles: Array, shift_m: Array, step_m: float, out: Array) -> None:
+    """Profiles (run, uav, station, 2) as seen from where the UAVs have come to, in place."""
+    for r in range(profiles.shape[0]):
+        for i in range(profiles.shape[1]):
+            resample(profiles[r, i], shift_m[r, i], step_m, out[r, i])

@@ -1,0 +1,142 @@
+"""What guidance weighs against what."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from napf_mpc.planners.guide_lattice import Lattice, Prices
+from napf_mpc.planners.guide_search import Search
+
+FINE = 2
+"""Stations of a profile for one of the finer lattice."""
+
+
+@dataclass(frozen=True)
+class GuidanceSettings:
+    """What guidance weighs against what; one set for all scenes."""
+
+    period_s: float = 0.4
+    """Time between plans [s]."""
+    ahead_m: float = 48.0
+    """How far it looks [m]."""
+    step_m: float = 2.0
+    """Distance between stations of the lattice [m]."""
+    cell_m: float = 1.0
+    """Width of a lateral cell [m]."""
+    widest_m: float = 30.0
+    """Largest lateral offset [m]."""
+    layer_m: float = 2.0
+    """Height of a layer [m]."""
+    highest_m: float = 16.0
+    """Highest climb over what stands on the ground [m]."""
+    sphere_layers: int = 8
+    """Layers to pass spheres, half of them up and half down."""
+    wide_m: float = 6.0
+    """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
+    path: float = 1.0
+    """Price of a squared offset from the lane [1/m^2 per metre of path]."""
+    shape: float = 1.0
+    """Price of a squared difference to the mean of all offsets [1/m^2 per metre]."""
+    far_m: float = 8.0
+    """Offsets beyond this are priced linearly [m]."""
+    slope: float = 16.0
+    """Price of a squared slope [per metre]."""
+    steep: float = 0.7
+    """Slope from which that price rises with the slope's fourth power."""
+    bend: float = 30.0
+    """Price of a squared change of slope per metre [m^2 per metre]."""
+    keep: float = 1.0
+    """Price of a squared difference to the last profile [1/m^2 per metre]."""
+    keep_m: float = 4.0
+    """Differences beyond this cost no more: another side may be taken if it is clearly cheaper [m]."""
+    spare_m: float = 0.3
+    """Distance kept beyond radius and k sigma, where there is room [m]."""
+    spare: float = 200.0
+    """Price of a squared lack of spare [1/m^2 per metre]."""
+    breach: float = 5000.0
+    """Price of a lack of margin [1/m per metre]."""
+    start: float = 30.0
+    """Price of a squared distance of the start from where the UAV is, where something is near [1/m^2]."""
+    apart: float = 100.0
+    """Price of a squared lack of separation between UAVs [1/m^2 per metre]."""
+    apart_share: float = 0.6
+    """Separation asked for is at most this share of the two slots' distance."""
+    passes: int = 10
+    """Passes of smoothing."""
+    pass_m: float = 0.7
+    """Largest step of a pass [m]."""
+    shared_gain: float = 0.9
+    """One way for all is taken if it costs less than this share of individual ways."""
+    flown_slope: float = 1.4
+    """Slope that is flown at full pace."""
+    bend_m: float = 6.0
+    """Distance over which steeper pieces are slowed down for [m]."""
+    tolerance_m: float = 0.25
+    """Breach from which a way counts as blocked [m]."""
+    stop_m: float = 5.0
+    """Distance to a blocked place at which the formation holds [m]."""
+    slow_m: float = 10.0
+    """It slows over this distance before [m]."""
+    release_m: float = 2.0
+    """A hold ends when the blocked place is this much farther away [m]."""
+    aside: float = 20.0
+    """Price of a metre aside or up on the spot, while holding."""
+    aside_after_s: float = 2.0
+    """A hold of this length lets UAVs look for a way aside on the spot [s]."""
+    squeeze_m: float = 0.8
+    """Breach that is accepted after a hold, and announced; 0 for never [m]."""
+    squeeze_after_s: float = 8.0
+    """Length of that hold [s]."""
+    aside_m: float = 1.5
+    """A UAV this far off its guide is waited for while the others hold [m]."""
+    hold_limit_s: float = 40.0
+    """A hold of this length is the end: no passage [s]."""
+    memory_s: float = 0.0
+    """Time constant with which sigmas seen before are forgotten; 0 plans with the present ones [s]."""
+    left_behind_m: float = 3.0
+    """A UAV this far behind its slot, with two sigma to that, is waited for [m]."""
+
+
+def _lattice(settings: GuidanceSettings, scale: int) -> Lattice:
+    step, layer = settings.step_m * scale, settings.layer_m * scale
+    return Lattice(
+        round(settings.ahead_m / step) + 1,
+        step,
+        FINE * scale,
+        round(settings.widest_m / settings.cell_m),
+        settings.cell_m * scale,
+        layer,
+        round(settings.highest_m / layer),
+        settings.sphere_layers,
+    )
+
+
+def search_of(settings: GuidanceSettings, k: float, radius_m: float) -> Search:
+    """Settings in the form that the compiled search reads, for a margin of k sigma and a radius [m]."""
+    return Search(
+        _lattice(settings, 1),
+        _lattice(settings, 2),
+        settings.wide_m,
+        Prices(
+            settings.path,
+            settings.shape,
+            settings.far_m,
+            settings.slope,
+            settings.steep,
+            settings.bend,
+            settings.keep,
+            settings.keep_m,
+            settings.spare,
+            settings.breach,
+            settings.spare_m,
+            settings.tolerance_m,
+            settings.aside,
+            settings.start,
+            settings.apart,
+        ),
+        k,
+        radius_m,
+        settings.passes,
+        settings.pass_m,
+        settings.shared_gain,
+    )

@@ -1,0 +1,107 @@
+"""NAPF along a guide: the potential field acts on UAVs whose lanes bend around what they cannot pass."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc import apf
+from napf_mpc.formation import reference_speed, synchronisation_error
+from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.guidance import Guidance
+from napf_mpc.planners.guide import Guide, Passage
+from napf_mpc.planners.guide_settings import GuidanceSettings
+from napf_mpc.planners.planner import Command, Reason
+from napf_mpc.planners.potential_field import PotentialFieldPlanner
+from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.safety_distance import Inflation
+from napf_mpc.world.obstacles import ObstacleSet
+
+Array = NDArray[np.float64]
+
+TANGENT_M = 2.0
+"""The reference direction is the guide's mean slope over this distance ahead."""
+PULL_PER_S = 0.5
+"""An avoiding UAV, which does not track its lane, is drawn to the guide at this rate ..."""
+MOST_PULL_MPS = 1.0
+"""... but no faster than this."""
+
+
+class GuidedNapfPlanner(PotentialFieldPlanner):
+    """NAPF that follows formation guidance: lane plus offset, and the guide's tangent as direction.
+
+    Away from obstacles it flies exactly like :class:`~napf_mpc.planners.potential_field.NapfPlanner`.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation, mission and planner settings.
+    settings : GuidanceSettings, optional
+        Of the guidance.
+    """
+
+    def __init__(self, problem: Problem, settings: GuidanceSettings | None = None) -> None:
+        super().__init__(problem, Inflation.of_problem(problem), "napf_guided")
+        self.guidance = Guidance(problem, self.inflation, settings)
+        self.guide: Guide | None = None
+
+    def reset(self, obstacles: ObstacleSet, runs: int) -> None:
+        """Take a new map and forget all plans."""
+        super().reset(obstacles, runs)
+        self.guidance.reset(obstacles, runs)
+
+    def step(self, nav: NavSolution, time_s: float) -> Command:
+        """Command of all UAVs from the reported solution, the map and the guide."""
+        settings, mission = self.problem.planner, self.problem.mission
+        assert isinstance(mission, FormationMission)
+        position, covariance, trusted = self._estimates(nav)
+        guide = self.guidance.step(position, covariance, trusted, time_s)
+        self.guide = guide
+        place = self._frame.to_path(position)
+        error = synchronisation_error(place[..., 0], self._offsets[:, 0])
+        speed = guide.pace * reference_speed(
+            mission.speed_mps,
+            self.problem.formation.sync_gain,
+            error,
+            settings.min_speed_ratio * mission.speed_mps,
+            settings.max_speed_ratio * mission.speed_mps,
+        )
+        force, avoiding = self._repulsion(position, covariance)
+        lane = self._offsets[:, 1:] + guide.at(0.0)
+        off = lane - place[..., 1:]
+        slope = guide.slope(0.0, TANGENT_M)
+        sideways = speed[..., None] * slope
+        held = guide.pace <= 0.0
+        drawn = avoiding | held
+        sideways = sideways + np.where(drawn[..., None], _limited(PULL_PER_S * off, MOST_PULL_MPS), 0.0)
+        reference = self._frame.directions_to_world(np.concatenate([speed[..., None], sideways], axis=-1))
+        velocity = apf.velocity_update(reference, force, settings.max_speed_ratio * mission.speed_mps)
+        turned = apf.limit_turn(
+            velocity, self._frame.along, self._frame.left, math.radians(settings.max_turn_deg)
+        )
+        size = np.sqrt(velocity[..., 0] ** 2 + velocity[..., 1] ** 2 + velocity[..., 2] ** 2)
+        point = self._frame.to_world(np.concatenate([place[..., :1], lane], axis=-1))
+        # Held, a UAV may give way in any direction: it has none of its own.
+        command = Command(
+            position=np.where(drawn[..., None], position, point),
+            velocity=np.where(held[..., None], velocity, turned * size[..., None]),
+            direction=np.where(held[..., None], 0.0, turned),
+            yaw=np.full(trusted.shape, self._frame.heading_rad),
+            holding=~trusted | held,
+            feedforward=np.zeros((*trusted.shape, 4)),
+        )
+        return replace(self._hold(command, trusted), reason=waiting_reasons(guide))
+
+
+def waiting_reasons(guide: Guide) -> NDArray[np.int8]:
+    """Codes of :class:`~napf_mpc.planners.planner.Reason` for UAVs that guidance holds."""
+    held = np.where(guide.reason == Passage.HOLD, Reason.WAITING, Reason.NONE)
+    return np.where(guide.reason == Passage.NO_PASSAGE, Reason.NO_PASSAGE, held).astype(np.int8)
+
+
+def _limited(vectors: Array, most: float) -> Array:
+    size = np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2)
+    return np.asarray(vectors * (most / np.maximum(size, most))[..., None])

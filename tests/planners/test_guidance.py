@@ -1,0 +1,354 @@
+"""Guidance stepped alone: where the virtual structure goes, in metres, and what it says when it cannot."""
+
+import math
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from napf_mpc.block import simulate
+from napf_mpc.errors import ProblemError
+from napf_mpc.formation import PathFrame
+from napf_mpc.planners.guidance import Guidance
+from napf_mpc.planners.guide import Guide, Passage
+from napf_mpc.planners.guide_band import WIDTH, solve_band
+from napf_mpc.planners.guide_settings import GuidanceSettings
+from napf_mpc.planners.guided_field import GuidedNapfPlanner
+from napf_mpc.planners.registry import make_planner
+from napf_mpc.problem import Problem
+from napf_mpc.problem_file import load_problem
+from napf_mpc.safety_distance import Inflation
+from napf_mpc.world.obstacles import ObstacleSet
+from napf_mpc.world.shapes import Box, Cylinder, Shape, Sphere
+
+Array = NDArray[np.float64]
+
+SLOTS = np.array([(6.403, 3.0, 0.0), (-6.403, -3.0, 0.0), (3.0, -6.403, 0.0), (-3.0, 6.403, 0.0)])
+RADIUS = 0.3
+K_SIGMA = 1.5
+"""k = 3 with a sigma of 0.5 m."""
+SETTINGS = GuidanceSettings()
+ENDLESS = 1000.0
+
+
+def problem(**sections: Any) -> Problem:
+    given: dict[str, Any] = {
+        "vehicle": {"radius_m": RADIUS},
+        "formation": {"shape": "square"},
+        "mission": {"kind": "formation", "length_m": 150.0},
+        "world": {"kind": "empty"},
+    }
+    return Problem.model_validate(given | sections)
+
+
+def advanced(along_m: float) -> Array:
+    """Places of UAVs in their slots, this far along the path."""
+    return np.asarray(SLOTS + np.array([along_m, 0.0, 0.0]))
+
+
+def isotropic(sigma: float, runs: int = 1) -> Array:
+    return np.tile(np.eye(3) * sigma**2, (runs, 4, 1, 1))
+
+
+def guidance(shapes: list[Shape], settings: GuidanceSettings = SETTINGS, **sections: Any) -> Guidance:
+    made = Guidance(problem(**sections), Inflation(3.0), settings)
+    made.reset(ObstacleSet.from_shapes(shapes), 1)
+    return made
+
+
+def follow(
+    made: Guidance, *, until_m: float = 110.0, time_limit_s: float = 110.0, sigma: float = 0.5
+) -> tuple[list[Array], list[Guide]]:
+    """UAVs that follow the guide as well as a vehicle of 2 m/s can: places and guides every 0.1 s."""
+    place = advanced(8.0)
+    covariance, trusted = isotropic(sigma), np.ones((1, 4), dtype=bool)
+    places, guides = [], []
+    for step in range(round(10 * time_limit_s)):
+        guide = made.step(place[None], covariance, trusted, 0.1 * step)
+        places.append(place)
+        guides.append(guide)
+        if place[:, 0].min() >= until_m or (guide.reason == Passage.NO_PASSAGE).all():
+            break
+        error = place[:, 0] - place[:, 0].mean() - SLOTS[:, 0]
+        speed = guide.pace[0] * np.clip(2.0 - 0.5 * error, 0.4, 3.0)
+        off = SLOTS[:, 1:] + guide.at(0.0)[0] - place[:, 1:]
+        aside = speed[:, None] * guide.slope(0.0, 2.0)[0] + off
+        aside *= np.minimum(1.0, 2.5 / np.maximum(np.hypot(*aside.T), 1e-9))[:, None]
+        place = place + 0.1 * np.column_stack([speed, aside])
+    return places, guides
+
+
+def clearance(made: Guidance, places: list[Array]) -> float:
+    """Least distance [m] from the hull of any UAV to any obstacle."""
+    return float(made._obstacles.signed_distance(np.concatenate(places)[None]).min()) - RADIUS
+
+
+def reasons(guides: list[Guide]) -> set[int]:
+    return {int(code) for guide in guides for code in np.unique(guide.reason)}
+
+
+# ------------------------------------------------------------------------------------- where it is free
+
+
+def test_a_free_lane_is_left_alone_to_the_last_bit() -> None:
+    made = guidance([Sphere((60.0, 40.0, 0.0), 2.0)])
+    _, guides = follow(made, until_m=60.0)
+    for guide in guides:
+        assert (guide.offset == 0.0).all()
+        assert (guide.pace == 1.0).all()
+        assert (guide.reason == Passage.NONE).all()
+        assert (guide.breach_m == 0.0).all()
+
+
+def test_the_guide_starts_where_the_uav_is_and_looks_tens_of_metres_ahead() -> None:
+    guide = guidance([]).step(SLOTS[None], isotropic(0.5), np.ones((1, 4), dtype=bool), 0.0)
+    assert guide.ahead_m[0] == 0.0
+    assert 30.0 <= guide.ahead_m[-1] <= 60.0
+    assert guide.offset.shape == (1, 4, len(guide.ahead_m), 2)
+
+
+# --------------------------------------------------------------------------------------------- detours
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [Cylinder((50.0, 3.0), 1.5), Sphere((50.0, 3.0, 0.0), 1.5), Box((50.0, 3.0, 0.0), (3.0, 3.0, 90.0))],
+)
+def test_head_on_it_goes_round_one_side_with_its_margin_and_comes_back(shape: Shape) -> None:
+    made = guidance([shape])
+    places, guides = follow(made)
+    assert clearance(made, places) > K_SIGMA - SETTINGS.tolerance_m
+    assert np.abs(places[-1][:, 1:] - SLOTS[:, 1:]).max() < 0.2
+    assert reasons(guides) == {Passage.NONE, Passage.DETOUR}
+    # No farther than it needs: radius, k sigma, spare and some for the solid's own size.
+    assert max(np.abs(place[0, 1:] - SLOTS[0, 1:]).max() for place in places) < 1.5 + RADIUS + K_SIGMA + 1.0
+
+
+def test_one_obstacle_moves_one_uav_and_not_the_formation() -> None:
+    made = guidance([Cylinder((50.0, 3.5), 1.5)])
+    places, _ = follow(made)
+    away = np.array([np.abs(place[:, 1] - SLOTS[:, 1]) for place in places]).max(0)
+    assert away[0] > 2.0
+    assert away[1:].max() < 0.5 * away[0]
+
+
+def test_a_side_once_taken_is_kept() -> None:
+    """An obstacle exactly on the lane, and estimates that shake about it."""
+    made = guidance([Cylinder((60.0, 3.0), 1.5)])
+    rng = np.random.default_rng(1)
+    sides = []
+    for step in range(100):
+        shaken = advanced(8.0 + 0.4 * step) + rng.normal(0.0, 0.3, (4, 3))
+        guide = made.step(shaken[None], isotropic(0.5), np.ones((1, 4), dtype=bool), 0.4 * step)
+        beside = round(60.0 - shaken[0, 0])
+        if 3 <= beside < len(guide.ahead_m):
+            sides.append(np.sign(guide.offset[0, 0, beside, 0]))
+    assert len(sides) > 60
+    assert len(set(sides)) == 1
+
+
+def test_a_wide_wall_is_gone_round() -> None:
+    made = guidance([Box((60.0, 0.0, 0.0), (2.0, 40.0, ENDLESS))])
+    places, guides = follow(made)
+    assert places[-1][:, 0].min() >= 110.0
+    assert clearance(made, places) > K_SIGMA - SETTINGS.squeeze_m
+    assert Passage.NO_PASSAGE not in reasons(guides)
+
+
+def test_a_low_wall_is_climbed() -> None:
+    """Top 5 m above the lanes, far too wide to go round."""
+    made = guidance([Box((60.0, 0.0, -45.0), (2.0, 400.0, 100.0))])
+    places, _ = follow(made)
+    over = min(place[i, 2] for place in places for i in range(4) if abs(place[i, 0] - 60.0) < 0.5)
+    assert over > 5.0 + RADIUS + K_SIGMA - SETTINGS.squeeze_m
+    assert over < 10.0
+    assert clearance(made, places) > K_SIGMA - SETTINGS.squeeze_m
+
+
+def test_nobody_dives_under_what_stands_on_the_ground() -> None:
+    made = guidance([Box((60.0, 3.0, 52.0), (4.0, 4.0, 100.0))])  # its base 2 m above the lanes
+    places, _ = follow(made)
+    assert min(place[:, 2].min() for place in places) > -0.3
+
+
+def test_a_dead_end_is_not_entered() -> None:
+    walls: list[Shape] = [
+        Box((70.0, 0.0, 0.0), (2.0, 30.0, ENDLESS)),
+        Box((60.0, 14.0, 0.0), (20.0, 2.0, ENDLESS)),
+        Box((60.0, -14.0, 0.0), (20.0, 2.0, ENDLESS)),
+    ]
+    made = guidance(walls)
+    places, guides = follow(made)
+    assert places[-1][:, 0].min() >= 110.0
+    assert Passage.NO_PASSAGE not in reasons(guides)
+    assert clearance(made, places) > K_SIGMA - SETTINGS.squeeze_m
+
+
+# --------------------------------------------------------------------------------- what cannot be passed
+
+
+def test_an_endless_wall_is_held_before_and_declared_impassable() -> None:
+    made = guidance([Box((60.0, 0.0, 0.0), (2.0, 400.0, ENDLESS))])
+    places, guides = follow(made)
+    assert {Passage.HOLD, Passage.NO_PASSAGE} <= reasons(guides)
+    assert (guides[-1].reason == Passage.NO_PASSAGE).all()
+    assert (guides[-1].pace == 0.0).all()
+    assert clearance(made, places) > K_SIGMA
+    held = 0.1 * sum((guide.pace == 0.0).all() for guide in guides)
+    assert held == pytest.approx(SETTINGS.hold_limit_s, abs=2.0)
+
+
+def gap(width_m: float) -> list[Shape]:
+    shift = 0.5 * width_m + 100.0
+    return [Box((60.0, side * shift, 0.0), (2.0, 200.0, ENDLESS)) for side in (1.0, -1.0)]
+
+
+def test_a_gap_with_room_is_flown_in_file() -> None:
+    made = guidance(gap(2.0 * (RADIUS + K_SIGMA) + 1.0))
+    places, guides = follow(made)
+    assert clearance(made, places) > K_SIGMA - SETTINGS.tolerance_m - 0.2
+    assert Passage.HOLD not in reasons(guides)
+    apart = [np.linalg.norm(place[i] - place[j]) for place in places for i in range(4) for j in range(i)]
+    assert min(apart) > 2.0
+
+
+def test_a_gap_too_narrow_for_the_margin_is_refused_or_announced() -> None:
+    narrow = gap(2.0 * (RADIUS + K_SIGMA) - 1.0)
+    never = guidance(narrow, GuidanceSettings(squeeze_m=0.0))
+    places, guides = follow(never)
+    assert (guides[-1].reason == Passage.NO_PASSAGE).all()
+    assert places[-1][:, 0].max() < 60.0
+
+    after_a_hold = guidance(narrow)
+    places, guides = follow(after_a_hold)
+    assert places[-1][:, 0].min() >= 110.0
+    assert {Passage.HOLD, Passage.SQUEEZE} <= reasons(guides)
+    # What is planned is announced; how well it is flown is not guidance's.
+    announced = max(float(guide.breach_m.max()) for guide in guides)
+    assert announced == pytest.approx(0.5, abs=0.35)
+    assert clearance(after_a_hold, places) > K_SIGMA - announced - 0.5
+
+
+def test_a_hold_ends_when_navigation_gets_better() -> None:
+    made = guidance(gap(2.0 * (RADIUS + K_SIGMA) + 0.6), GuidanceSettings(squeeze_m=0.0))
+    place = advanced(47.0)
+    trusted = np.ones((1, 4), dtype=bool)
+    for step in range(20):
+        guide = made.step(place[None], isotropic(1.2), trusted, 0.4 * step)
+    assert (guide.reason == Passage.HOLD).all()
+    assert (guide.pace == 0.0).all()
+    for step in range(20, 30):
+        guide = made.step(place[None], isotropic(0.5), trusted, 0.4 * step)
+    assert (guide.pace > 0.0).all()
+    assert Passage.HOLD not in guide.reason
+
+
+def test_the_others_slow_for_one_left_behind() -> None:
+    made = guidance([])
+    place = advanced(50.0)
+    place[1, 0] -= 12.0
+    guide = made.step(place[None], isotropic(0.5), np.ones((1, 4), dtype=bool), 0.0)
+    assert guide.pace[0, 1] == 1.0
+    assert (guide.pace[0, [0, 2, 3]] < 0.7).all()
+    assert guide.reason[0].tolist() == [Passage.WAIT, Passage.NONE, Passage.WAIT, Passage.WAIT]
+
+
+# -------------------------------------------------------------------------- frames, trust, blocks of runs
+
+
+def test_turning_the_world_turns_the_guide() -> None:
+    shapes: list[Shape] = [Cylinder((40.0, 3.0), 1.5), Sphere((48.0, -6.0, 0.5), 1.0)]
+    plain = guidance(shapes).step(advanced(10.0)[None], isotropic(0.5), np.ones((1, 4), dtype=bool), 0.0)
+    path = PathFrame.from_angles((5.0, -7.0, 2.0), math.pi / 2, 0.0)
+    made = guidance(
+        [Cylinder((5.0 - 3.0, -7.0 + 40.0), 1.5), Sphere((5.0 + 6.0, -7.0 + 48.0, 2.5), 1.0)],
+        mission={"kind": "formation", "length_m": 150.0, "heading_deg": 90.0, "start_m": (5.0, -7.0, 2.0)},
+    )
+    turned = made.step(path.to_world(advanced(10.0))[None], isotropic(0.5), np.ones((1, 4), dtype=bool), 0.0)
+    np.testing.assert_allclose(turned.offset, plain.offset, atol=1e-6)
+    assert np.abs(plain.offset).max() > 2.0
+
+
+def test_what_is_not_trusted_does_not_reach_the_plan() -> None:
+    made = guidance([Cylinder((40.0, 3.0), 1.5)])
+    place, covariance = advanced(10.0)[None], isotropic(0.5)
+    before = made.step(place, covariance, np.ones((1, 4), dtype=bool), 0.0)
+    place, covariance = place.copy(), covariance.copy()
+    place[0, 2], covariance[0, 2] = np.nan, np.nan
+    after = made.step(place, covariance, np.array([[True, True, False, True]]), 0.4)
+    for field in fields(Guide):
+        assert np.isfinite(getattr(after, field.name)).all(), field.name
+    np.testing.assert_allclose(after.offset, before.offset, atol=1.0)
+
+
+def test_a_run_does_not_depend_on_its_block() -> None:
+    scene = load_problem("study_40c")
+    settings = {"navigation": scene.navigation.model_copy(update={"filter": "kalman"})}
+    short = scene.simulation.model_copy(update={"time_limit_s": 25.0})
+    case = scene.model_copy(update=settings | {"simulation": short})
+    together = simulate(case, "napf_guided", seed=101, runs=range(3), record_every=10).trajectories
+    alone = simulate(case, "napf_guided", seed=101, runs=range(1, 2), record_every=10).trajectories
+    mine = together["run"] == 1
+    assert mine.any()
+    for name, column in alone.items():
+        np.testing.assert_array_equal(together[name][mine], column, err_msg=name)
+
+
+def test_degenerate_starts_are_planned_with_finite_numbers() -> None:
+    """On the axis of a cylinder, at the centre of a sphere, all UAVs in one place, far off the lattice."""
+    made = guidance([Cylinder((10.0, 3.0), 1.5), Sphere((10.0, -3.0, 0.0), 1.0)])
+    trusted = np.ones((1, 4), dtype=bool)
+    for step, place in enumerate(
+        [
+            np.array([(10.0, 3.0, 0.0), (10.0, -3.0, 0.0), (10.0, 3.0, 0.0), (10.0, 3.0, 0.0)]),
+            np.tile((10.0, 0.0, 0.0), (4, 1)),
+            SLOTS + np.array([0.0, 500.0, -300.0]),
+        ]
+    ):
+        guide = made.step(place[None], isotropic(0.5), trusted, 0.4 * step)
+        assert np.isfinite(guide.offset).all()
+        assert np.isfinite(guide.pace).all()
+
+
+# ----------------------------------------------------------------------------------------- planner, parts
+
+
+def test_the_guided_planner_flies_like_napf_where_nothing_is_in_the_way() -> None:
+    case = problem(simulation={"time_limit_s": 20.0})
+    flown = [
+        simulate(case, name, seed=101, runs=1, record_every=10).trajectories
+        for name in ("napf", "napf_guided")
+    ]
+    for axis in ("x_m", "y_m", "z_m"):
+        np.testing.assert_allclose(flown[1][axis], flown[0][axis], atol=1e-9)
+
+
+def test_the_registry_makes_the_guided_planner() -> None:
+    planner = make_planner("napf_guided", problem())
+    assert isinstance(planner, GuidedNapfPlanner)
+    assert planner.name == "napf_guided"
+
+
+def test_guidance_needs_a_formation() -> None:
+    walk = Problem.model_construct(
+        **(problem().__dict__ | {"mission": load_problem("single_uav").mission}),
+    )
+    with pytest.raises(ProblemError, match="formation"):
+        Guidance(walk, Inflation(3.0))
+
+
+def test_the_band_solver_solves() -> None:
+    rng = np.random.default_rng(3)
+    n = 14
+    lower = np.tril(rng.normal(size=(n, n))) * (np.subtract.outer(range(n), range(n)) < WIDTH)
+    full = lower @ lower.T + np.eye(n)
+    band = np.zeros((n, WIDTH))
+    for j in range(n):
+        for d in range(min(j + 1, WIDTH)):
+            band[j, d] = full[j, j - d]
+    right = rng.normal(size=n)
+    wanted = np.linalg.solve(full, right)
+    solve_band(band, right, n)
+    np.testing.assert_allclose(right, wanted, rtol=1e-9, atol=1e-12)
