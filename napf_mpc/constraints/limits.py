@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
-from napf_mpc.problem import FormationMission
+from napf_mpc.problem import FormationMission, Vehicle
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
 
@@ -27,8 +27,12 @@ SPEED_W1, SPEED_W2 = 100.0, 10.0
 A slack of 1 m/s over one second is worth 1 m of position, hence a tenth of the price of a metre of clearance:
 a UAV may be hurried out of an obstacle, but not to catch up with its slot.
 """
-TILT_W1, TILT_W2 = 1000.0, 1000.0
-"""Prices of a tilt slack [1/(rad s)], [1/(rad^2 s)]; 0.1 rad of tilt is 1 m/s^2."""
+TILT_W1, TILT_W2 = 1e5, 1e4
+"""Prices of a tilt slack [1/(rad s)], [1/(rad^2 s)].
+
+A UAV that reports itself metres inside a margin gains by every radian: one radian for 0.1 s is 1 m/s, worth
+some thousands over the next seconds. The model knows nothing of that, since it never tumbles.
+"""
 PLACE_W1, PLACE_W2 = 1000.0, 100.0
 """Prices of a height or fence slack [1/(m s)], [1/(m^2 s)]; as for obstacles."""
 
@@ -263,4 +267,61 @@ class RotorLimits:
             _everywhere(horizon, inverse),
             _everywhere(horizon, kept - hover),
             _everywhere(horizon, most - kept - hover),
+        )
+
+
+@dataclass(frozen=True)
+class InputBox:
+    """Hold thrust and torques in a box inside what the rotors give; hard, in newtons and newton metres.
+
+    Smaller than :class:`RotorLimits`: the linear model does not know that a vehicle turned over in a tenth of
+    a second is no longer one near hover, and the box leaves the rotors' reserve to the feedback.
+    """
+
+    least_thrust: float = 0.4
+    """Least thrust over that of hover."""
+    most_thrust: float = 1.7
+    """Largest thrust over that of hover."""
+    turn_radps2: float = 25.0
+    """Largest angular acceleration in roll and pitch [rad/s^2]."""
+    yaw_radps2: float = 5.0
+    """Largest angular acceleration in yaw [rad/s^2]."""
+
+    def __post_init__(self) -> None:
+        _positive(turn_radps2=self.turn_radps2, yaw_radps2=self.yaw_radps2)
+        if not 0.0 <= self.least_thrust < 1.0 < self.most_thrust:
+            raise ConstraintError(
+                f"least_thrust = {self.least_thrust!r}, most_thrust = {self.most_thrust!r}: hover, 1, must lie "
+                "between them"
+            )
+
+    @property
+    def name(self) -> str:
+        """Name in results and errors."""
+        return "inputs"
+
+    def bounds(self, vehicle: Vehicle) -> tuple[Array, Array]:
+        """Lower and upper bounds (4,) on the input about hover [N, N m].
+
+        Where the rotors cannot give every input of the box, it shrinks about hover until they can.
+        """
+        hover, inertia = hover_input(vehicle), np.array(vehicle.inertia_kgm2)
+        torque = inertia * np.array([self.turn_radps2, self.turn_radps2, self.yaw_radps2])
+        lower = np.append((self.least_thrust - 1.0) * hover[0], -torque)
+        upper = np.append((self.most_thrust - 1.0) * hover[0], torque)
+        inverse, most = mixer_inverse(vehicle), rotor_limit(vehicle)
+        rest = inverse @ hover
+        highest = np.maximum(inverse * lower, inverse * upper).sum(1)
+        lowest = np.minimum(inverse * lower, inverse * upper).sum(1)
+        part = min(1.0, float(((most - rest) / highest).min()), float((rest / -lowest).min()))
+        return part * lower, part * upper
+
+    def rows(self, horizon: Horizon) -> LinearRows:
+        """Rows ``lower <= u <= upper`` of the four inputs about hover [N, N m]."""
+        lower, upper = self.bounds(horizon.problem.vehicle)
+        return LinearRows(
+            "input",
+            _everywhere(horizon, np.eye(4)),
+            _everywhere(horizon, lower),
+            _everywhere(horizon, upper),
         )

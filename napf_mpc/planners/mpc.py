@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
-from napf_mpc.constraints.limits import RotorLimits, SpeedLimit, TiltLimit
+from napf_mpc.constraints.limits import InputBox, SpeedLimit, TiltLimit
 from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
@@ -36,6 +36,8 @@ Mask = NDArray[np.bool_]
 POSITION, VELOCITY = slice(0, 6, 2), slice(1, 6, 2)
 NEIGHBOURS = 3
 """Neighbours that each stage of each UAV keeps rows for, at most."""
+UPSET_RAD = 1.0
+"""Roll or pitch beyond which the model about hover is worth nothing: the inner loop levels the UAV first."""
 SLOT_PART, OPENING_MPS = 0.7, 1.0
 """What is asked of neighbours at most: this part of the distance of their slots, and no faster parting."""
 SPEED_PRICE = (1000.0, 1000.0)
@@ -54,7 +56,7 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
     others: list[Constraint] = [apart] if neighbours else []
     speed = SpeedLimit(w1=SPEED_PRICE[0], w2=SPEED_PRICE[1])
-    return [contact, influence, *others, speed, TiltLimit(), RotorLimits()]
+    return [contact, influence, *others, speed, TiltLimit(), InputBox()]
 
 
 def weights(settings: Settings) -> tuple[Array, Array]:
@@ -168,10 +170,11 @@ class QpPlanner:
         answer = self._solve(state, reference, nav, trusted, time_s)
         late = self._clock is not None and not self._clock() - began <= self._period_s
         refused = refusals(answer, self._limits)
-        accepted = (refused == Refusal.NONE) & trusted & (not late)
-        causes = np.where(late, "late", _CAUSES[refused])
+        upset = np.abs(state[..., 6:10:2]).max(-1) > UPSET_RAD
+        accepted = (refused == Refusal.NONE) & trusted & ~upset & (not late)
+        causes = np.where(upset, "upset", np.where(late, "late", _CAUSES[refused]))
         causes = np.where(trusted, causes, np.where(airborne, "navigation", ""))
-        flown, action = self._choose(time_s, state, answer, accepted, trusted, causes)
+        flown, action = self._choose(time_s, state, answer, accepted, trusted & ~upset, causes)
         self._plan, self._answer = flown, answer
         self._count(answer, action, accepted, trusted, airborne)
         self._count_short_margins(nav, trusted)
@@ -275,7 +278,7 @@ class QpPlanner:
         state: Array,
         answer: BatchResult,
         accepted: Mask,
-        trusted: Mask,
+        sound: Mask,
         causes: NDArray[np.str_],
     ) -> tuple[Plan, Codes]:
         """Plans that fly from now on, and by which rung of the ladder."""
@@ -290,8 +293,8 @@ class QpPlanner:
             no_need = np.zeros(accepted.shape, dtype=bool)
             return new, self.ladder.decide(time_s, accepted, self._made_s, no_need, causes)
         tail = still if old is None else old.resumed(time_s, step_s)
-        # Without navigation nothing tells whether the tail is followed.
-        clear = trusted & (self._clearance(tail) >= 0.0)
+        # Without navigation nothing tells whether the tail is followed; upset, it cannot be.
+        clear = sound & (self._clearance(tail) >= 0.0)
         action = self.ladder.decide(time_s, accepted, time_s - self._made_s, clear, causes)
         self._made_s = np.where(accepted, time_s, self._made_s)
         return new.where(accepted, tail.where(action == Action.TAIL, still)), action
