@@ -291,8 +291,8 @@ class InputBox:
         _positive(turn_radps2=self.turn_radps2, yaw_radps2=self.yaw_radps2)
         if not 0.0 <= self.least_thrust < 1.0 < self.most_thrust:
             raise ConstraintError(
-                f"least_thrust = {self.least_thrust!r}, most_thrust = {self.most_thrust!r}: hover, 1, must lie "
-                "between them"
+                f"least_thrust = {self.least_thrust!r}, most_thrust = {self.most_thrust!r}: hover, 1, must "
+                "lie between them"
             )
 
     @property
