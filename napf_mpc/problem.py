@@ -628,7 +628,7 @@ class Planner(_Section):
     """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]."""
     contact_extra_m: float = Field(0.0, ge=0.0, le=1e3)
     """QP planner: distance kept from obstacles on top of the margin."""
-    influence_scale: float = Field(0.02, ge=1e-9, le=1e6)
+    influence_scale: float = Field(0.01, ge=1e-9, le=1e6)
     """QP planner: price per metre and second for each m/s of NAPF's repulsion."""
     k: Annotated[float, Field(ge=0.0, le=20.0)] | None = None
     """Inflation in reported sigmas; 3 unless ``confidence`` is given."""

@@ -33,9 +33,9 @@ class GuidanceSettings:
     """Layers to pass spheres, half of them up and half down."""
     wide_m: float = 6.0
     """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
-    path: float = 1.0
+    path: float = 1.5
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
-    shape: float = 1.0
+    shape: float = 2.5
     """Price of a squared difference to the mean of all offsets [1/m^2 per metre]."""
     far_m: float = 8.0
     """Offsets beyond this are priced linearly [m]."""

@@ -13,14 +13,15 @@ from napf_mpc.constraints.contract import check_constraint, sample_horizon, samp
 from napf_mpc.constraints.limits import (
     AltitudeBand,
     Geofence,
+    InputBox,
     RotorLimits,
     SpeedLimit,
     TiltLimit,
     inward_normals,
 )
-from napf_mpc.problem import Problem
+from napf_mpc.problem import Problem, Vehicle
 from napf_mpc.safety_distance import Inflation
-from napf_mpc.vehicle.quadrotor import hover_input, mixer, rotor_limit
+from napf_mpc.vehicle.quadrotor import hover_input, mixer, mixer_inverse, rotor_limit
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -209,3 +210,42 @@ def test_contract(constraint: Constraint) -> None:
 def test_settings_that_mean_nothing_are_refused(make: Any, name: str) -> None:
     with pytest.raises(ConstraintError, match=name):
         make()
+
+
+@pytest.mark.parametrize("thrust_to_weight", [1.05, 1.5, 2.2, 5.0])
+def test_every_input_of_the_box_is_one_that_the_rotors_give(thrust_to_weight: float) -> None:
+    vehicle = Vehicle(thrust_to_weight=thrust_to_weight)
+    lower, upper = InputBox().bounds(vehicle)
+    assert (lower < 0.0).all()
+    assert (upper > 0.0).all()
+    corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(4, -1).T
+    thrusts = (corners + hover_input(vehicle)) @ mixer_inverse(vehicle).T
+    assert thrusts.min() > -1e-12
+    assert thrusts.max() < rotor_limit(vehicle) + 1e-12
+    if thrust_to_weight == 5.0:  # nothing to shrink for
+        assert upper[0] == pytest.approx(0.7 * vehicle.mass_kg * 9.80665, rel=2e-3)
+        assert upper[1:] == pytest.approx(np.array(vehicle.inertia_kgm2) * [25.0, 25.0, 5.0])
+
+
+def test_the_box_holds_in_rows_as_it_is() -> None:
+    drawn = horizon()
+    rows = InputBox().rows(drawn)
+    lower, upper = InputBox().bounds(drawn.problem.vehicle)
+    assert not rows.soft
+    assert rows.violation(np.broadcast_to(upper, (*drawn.shape, 4))).max() == pytest.approx(0.0, abs=1e-12)
+    beyond = rows.violation(np.broadcast_to(upper + np.array([1.0, 0.0, 0.1, 0.0]), (*drawn.shape, 4)))
+    assert beyond[0, 0, 0] == pytest.approx([1.0, 0.0, 0.1, 0.0])
+    assert rows.violation(np.broadcast_to(lower - 0.5, (*drawn.shape, 4))) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"least_thrust": 1.0}, "least_thrust"),
+        ({"most_thrust": 0.9}, "most_thrust"),
+        ({"turn_radps2": 0.0}, "turn"),
+    ],
+)
+def test_a_box_without_hover_is_refused(settings: dict[str, float], name: str) -> None:
+    with pytest.raises(ConstraintError, match=name):
+        InputBox(**settings)

@@ -14,6 +14,7 @@ from napf_mpc.constraints.neighbours import (
     NeighbourSeparation,
     margin_attainable,
     relative_covariance,
+    slot_offsets,
     tangent,
 )
 from napf_mpc.constraints.probability import ellipsoid_half_space_bound
@@ -211,3 +212,30 @@ def test_three_sigma_of_5_m_do_not_fit_into_a_square_of_10_m() -> None:
 def test_settings_that_mean_nothing_are_refused(settings: dict[str, Any], name: str) -> None:
     with pytest.raises(ConstraintError, match=name):
         NeighbourSeparation(**settings)
+
+
+def test_what_is_asked_of_a_pair_is_no_more_than_its_slots_allow() -> None:
+    horizon = together((0.0, 0.0, 10.0), (4.0, 0.0, 10.0), sigma_m=5.0)
+    apart = np.linalg.norm(slot_offsets(horizon.problem, horizon.frame)[0, 1])
+    asked = 0.6 + 3.0 * 5.0 * np.sqrt(2.0)
+    assert asked > 2.0 * apart > 4.0
+    free = gaps(NeighbourSeparation(1, inflation=Inflation(3.0)), horizon)
+    capped = gaps(NeighbourSeparation(1, inflation=Inflation(3.0), slot_part=2.0), horizon)
+    assert free == pytest.approx(0.5 * (4.0 - asked))
+    assert capped == pytest.approx(0.5 * (4.0 - 2.0 * apart))
+
+
+def test_a_short_gap_is_asked_to_open_at_a_speed_and_never_to_less_than_the_bare_distance() -> None:
+    horizon = together((0.0, 0.0, 10.0), (2.0, 0.0, 10.0), sigma_m=5.0)
+    opened = gaps(NeighbourSeparation(1, inflation=Inflation(3.0), opening_mps=0.5), horizon)
+    wanted = 2.0 + 0.5 * np.cumsum(horizon.step_s)
+    assert opened[0, 0] == pytest.approx(0.5 * (2.0 - wanted)[:, None])
+    close = together((0.0, 0.0, 10.0), (0.2, 0.0, 10.0), sigma_m=5.0)
+    bare = gaps(NeighbourSeparation(1, inflation=Inflation(3.0), opening_mps=0.0), close)
+    assert bare == pytest.approx(0.5 * (0.2 - 0.6))
+
+
+@pytest.mark.parametrize(("name", "value"), [("slot_part", -0.1), ("opening_mps", math.nan)])
+def test_caps_that_mean_nothing_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ConstraintError, match=f"{name} = "):
+        NeighbourSeparation(1, **{name: value})

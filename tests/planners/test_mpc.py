@@ -15,6 +15,7 @@ from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.fallback import Action
 from napf_mpc.planners.mpc import QpPlanner, default_constraints
 from napf_mpc.planners.planner import Command, Reason
+from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import HorizonQp
@@ -75,7 +76,7 @@ def test_on_the_slots_in_free_air_the_plan_is_to_fly_straight_on_with_hover_thru
 
 
 def test_a_plan_keeps_k_sigma_and_its_radius_clear_of_a_wall_beside_the_lane() -> None:
-    asked = problem(planner={"kind": "qp", "influence_scale": 1e-6})
+    asked = problem(planner={"kind": "qp", "influence_scale": 1e-6, "guidance": "none"})
     planner = QpPlanner(asked)
     slots = on_slots(planner)
     # A long wall whose face is half a metre inside the left-most lane's margin of 3 * 0.3 + 0.3 m.
@@ -132,7 +133,7 @@ def test_turning_the_world_turns_the_plan(heading_deg: float) -> None:
     )  # fmt: skip
     plans = []
     for asked in (level, turned):
-        planner = QpPlanner(asked)
+        planner = QpPlanner(asked, guided=False)
         frame = planner._frame
         ball = frame.to_world(np.array([[6.0, 3.5, 0.2]]))[0]
         planner.reset(ObstacleSet.from_shapes([Sphere(tuple(ball), 1.0)]), 1)
@@ -342,3 +343,35 @@ def test_late_answers_are_only_known_where_there_is_a_clock() -> None:
     assert planner.step(solution, 0.0).holding.all()
     assert not planner.step(solution, 0.1).holding.any()
     assert [event.cause for event in planner.ladder.events] == ["late"] * 4
+
+
+def test_an_upset_uav_is_levelled_before_it_plans_again() -> None:
+    planner = QpPlanner(problem())
+    planner.reset(ObstacleSet.empty(), 1)
+    good = nav(on_slots(planner), cruising(planner))
+    planner.step(good, 0.0)
+    tilted = np.zeros((1, 4, 3))
+    tilted[0, 1, 0] = 1.2
+    command = planner.step(replace(good, attitude=tilted), 0.1)
+    np.testing.assert_array_equal(command.holding[0], [False, True, False, False])
+    assert [(e.uav, e.cause, e.action) for e in planner.ladder.events] == [(1, "upset", Action.HOVER)]
+
+
+def test_a_uav_that_finds_itself_deep_inside_a_margin_does_not_tumble() -> None:
+    """At the start errors of 10 m put the estimate into an obstacle: no plan may turn the vehicle over."""
+    flown = load_problem(
+        "study_8c",
+        {"navigation": {"filter": "kalman"}, "simulation": {"time_limit_s": 8.0}, "planner": {"kind": "qp"}},
+    )
+    track = simulate(flown, "qp", seed=101, runs=range(10, 11), record_every=5).trajectories
+    assert np.abs(track["roll_rad"]).max() < 0.9
+    assert np.abs(track["pitch_rad"]).max() < 0.9
+    assert np.abs(track["z_m"]).max() < 15.0
+
+
+def test_planners_by_name_fly_with_and_without_guidance() -> None:
+    asked = problem()
+    assert make_planner("qp", asked)._guidance is not None
+    assert make_planner("qp_unguided", asked)._guidance is None
+    assert make_planner("qp", problem(planner={"guidance": "none"}))._guidance is None
+    assert make_planner("qp_unguided", asked).name == "qp_unguided"
