@@ -1,12 +1,14 @@
-"""The program of one UAV in the hands of two general tools, for benchmarks: cvxpy with parameters, and do-mpc.
+"""The program of one UAV in the hands of two general tools, for benchmarks: cvxpy and do-mpc.
 
-Both are made once for a horizon's shapes and solve new numbers at each step, as their manuals advise. cvxpy is
-given the very program of the planner. do-mpc knows one length of stage only: its program has the size and
-the kinds of rows of the planner's, on a grid of even stages, and is solved by IPOPT as any of its programs.
+Both are made once for a horizon's shapes and solve new numbers at each step, as their manuals advise (cvxpy
+by its parameters). cvxpy is given the very program of the planner. do-mpc knows one length of stage only: its
+program has the size and the kinds of rows of the planner's, on a grid of even stages, with linear prices of
+slacks only, and is solved by IPOPT as any of its programs.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -45,8 +47,8 @@ class CvxpyController:
         model, n = horizon.model, horizon.model.stages
         self._x, self._u = cp.Variable(n * STATES), cp.Variable(n * INPUTS)
         self._initial, self._pull = cp.Parameter(STATES), cp.Parameter(n * STATES)
-        roots_q = sparse.block_diag([_root(q) for q in model.q])
-        roots_r = sparse.block_diag([_root(r) for r in model.r])
+        roots_q: Any = sparse.block_diag([_root(q) for q in model.q])
+        roots_r: Any = sparse.block_diag([_root(r) for r in model.r])
         cost = 0.5 * cp.sum_squares(roots_q @ self._x) + 0.5 * cp.sum_squares(roots_r @ self._u)
         cost = cost - self._pull @ self._x
         carried = sparse.block_diag(list(model.a[1:]))
@@ -64,6 +66,8 @@ class CvxpyController:
             rows += added
             cost = cost + price
         self._problem = cp.Problem(cp.Minimize(cost), rows)
+        self.solved = False
+        """Whether it calls its last answer optimal."""
 
     def _block(self, block: LinearRows) -> tuple[list[Any], Any]:
         """Rows of a block, and what its slacks cost."""
@@ -102,9 +106,9 @@ class CvxpyController:
         self._bounds.append((lower, upper))
         return rows, price
 
-    def solve(self, horizon: HorizonQp, uav: int) -> Array:
-        """Return the first input (4,) of a UAV of the first run."""
-        at = (0, uav)
+    def solve(self, horizon: HorizonQp) -> Array:
+        """Return the first input (4,) of the first UAV of the first run."""
+        at = (0, 0)
         self._initial.value = horizon.initial[at]
         self._pull.value = np.einsum("nij,nj->ni", horizon.model.q, horizon.reference[at]).ravel()
         for block, parameters, bounds, stiffness in zip(
@@ -120,6 +124,7 @@ class CvxpyController:
         self._problem.solve(
             solver="OSQP", warm_start=True, eps_abs=1e-4, eps_rel=1e-5, polishing=True, max_iter=20000
         )
+        self.solved = self._problem.status == self._cp.OPTIMAL
         return np.asarray(self._u.value[:INPUTS], dtype=float)
 
 
@@ -140,7 +145,8 @@ class DoMpcController:
 
     def __init__(self, horizon: HorizonQp, a: Array, b: Array, step_s: float) -> None:
         import casadi as ca
-        import do_mpc
+
+        do_mpc: Any = import_module("do_mpc")
 
         model: Any = do_mpc.model.Model("discrete", "SX")
         x = model.set_variable("_x", "x", shape=(STATES, 1))
@@ -159,7 +165,7 @@ class DoMpcController:
         mpc: Any = do_mpc.controller.MPC(model)
         mpc.settings.n_horizon, mpc.settings.t_step = horizon.model.stages, step_s
         mpc.settings.store_full_solution = False
-        mpc.settings.suppress_ipopt_output()
+        mpc.settings.nlpsol_opts.update({"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0})
         away = x - reference
         weights = horizon.model.q[0] / horizon.model.step_s[0] * step_s
         effort = ca.DM(horizon.model.r[0] / horizon.model.step_s[0] * step_s)
@@ -187,10 +193,12 @@ class DoMpcController:
         mpc.setup()
         self._mpc = mpc
         self._started = False
+        self.solved = False
+        """Whether it calls its last answer optimal."""
 
-    def solve(self, horizon: HorizonQp, uav: int) -> Array:
-        """Return the first input (4,) of a UAV of the first run."""
-        at, stages = (0, uav), horizon.model.stages
+    def solve(self, horizon: HorizonQp) -> Array:
+        """Return the first input (4,) of the first UAV of the first run."""
+        at, stages = (0, 0), horizon.model.stages
         for k in range(stages + 1):
             stage = min(k, stages - 1)
             self._template["_tvp", k, "reference"] = horizon.reference[at][stage]
@@ -203,7 +211,9 @@ class DoMpcController:
             self._mpc.x0 = horizon.initial[at]
             self._mpc.set_initial_guess()
             self._started = True
-        return np.asarray(self._mpc.make_step(horizon.initial[at][:, None]), dtype=float)[:, 0]
+        inputs = self._mpc.make_step(horizon.initial[at][:, None])
+        self.solved = bool(self._mpc.solver_stats["success"])
+        return np.asarray(inputs, dtype=float)[:, 0]
 
 
 def _root(weight: Array) -> Array:
