@@ -361,8 +361,10 @@ def main() -> int:
     counted = sum(stubs.tally[f"fall_back_{name}"] for name in FALL_BACKS)
     with_stubs, without = stubs.contacts(), plain.contacts()
     caused = int((with_stubs & ~without).any(-1).sum())
+    more = stubs.tally["answers_refused"] - sum(stubs.spoilt.values())
     print(
-        f"\nSpoilt: {kinds}; {sum(stubs.spoilt.values()) - counted} of them flown, as they passed the test."
+        f"\nSpoilt: {kinds}. Refused less spoilt: {more:+d} (a last answer may pass the test once more, and "
+        "one in good faith may fail it)."
     )
     print(f"Fall-backs counted and seen agree: {counted == stubs.fallen}.")
     print(

@@ -1,8 +1,8 @@
 """The separation rows' half-space against the published point of Zhu and Alonso-Mora (2019), Table I.
 
 An ellipsoid of half-axes (0.6, 0.6, 2.2) m, an offset of (0.7, 0.7, 0.8) m, a relative covariance of
-diag(0.04, 0.04, 0.01) m^2: the bound they print is 0.0171 and the exact chance 0.0109. Quadrature gives 0.011009
-for the latter (and 1e8 draws 0.01101 with a standard error of 0.00001), a per cent above the print.
+diag(0.04, 0.04, 0.01) m^2: the bound they print is 0.0171 and the exact chance 0.0109. Quadrature gives
+0.011009 for the latter (and 1e8 draws 0.01101 with a standard error of 0.00001), a per cent above the print.
 """
 
 import numpy as np
