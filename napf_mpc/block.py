@@ -36,6 +36,8 @@ class Block:
     """One row a planner: wall time of the block, kept apart from results."""
     trajectories: store.Columns
     """Rows by planner, run, time and UAV; no columns if not asked for."""
+    events: store.Columns
+    """One row a fall-back that a planner took to: planner, run, time, UAV, cause, action."""
 
 
 @dataclass(frozen=True)
@@ -145,15 +147,16 @@ def fly_block(
     # More threads than one would make workers fight for the cores, and win nothing on small matrices.
     with threadpool_limits(1):
         scenario = build_scenario(problem, seed, runs, data_folder)
-        rows, timing, trajectories = [], [], []
+        rows, timing, trajectories, events = [], [], [], []
         for name in planners:
             began = time.perf_counter()
             flown = _fly(problem, make_planner(name, problem), scenario, record_every)
             timing.append(timing_row(name, runs, time.perf_counter() - began))
             rows.append(score_rows(name, seed, flown.score, flown.tally))
+            events.append(flown.tally.event_columns(name, runs.start))
             if flown.trajectories:
                 trajectories.append(flown.trajectories)
-    return Block(store.stack(rows), store.stack(timing), store.stack(trajectories))
+    return Block(store.stack(rows), store.stack(timing), store.stack(trajectories), store.stack(events))
 
 
 def _fly(problem: Problem, planner: Planner, scenario: Scenario, record_every: int) -> Missions:

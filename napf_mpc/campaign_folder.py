@@ -1,8 +1,8 @@
 """The folder of a campaign: whose it is, which blocks are finished, and the tables made of them.
 
-A finished block is a file ``blocks/rows_<first>_<stop>.parquet``, with ``timing_`` and ``trajectories_`` of
-the same runs beside it. ``runs.parquet``, ``timing.parquet`` and ``summary.json`` are made from the blocks,
-and made again whenever the command is repeated.
+A finished block is a file ``blocks/rows_<first>_<stop>.parquet``, with ``timing_``, ``events_`` and
+``trajectories_`` of the same runs beside it. ``runs.parquet``, ``timing.parquet``, ``events.parquet`` and
+``summary.json`` are made from the blocks, and made again whenever the command is repeated.
 """
 
 from __future__ import annotations
@@ -100,6 +100,7 @@ class Blocks:
         """Keep a finished block."""
         tag = _tag(runs)
         store.write_table(self.folder / f"timing_{tag}", block.timing)
+        store.write_table(self.folder / f"events_{tag}", block.events)
         if block.trajectories:
             store.write_table(self.folder / f"trajectories_{tag}", block.trajectories)
         # Last: a block counts as finished once its rows are there.
@@ -186,6 +187,7 @@ def conclude(out: Path, blocks: Blocks, runs: int) -> dict[str, Any]:
                 f"{blocks.folder}: not every run of {planner} is there once; choose another --out"
             )
     store.write_table(out / "runs.parquet", rows)
+    store.write_table(out / "events.parquet", store.stack(list(tables("events"))))
     store.write_table(out / "timing.parquet", store.stack([blocks.table("timing", b) for b in finished]))
     if blocks.identity.get("record_every"):
         store.write_tables(out / "trajectories.parquet", tables("trajectories"))

@@ -14,6 +14,7 @@ from napf_mpc.block import Block, score_rows, timing_row
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import METRICS, Outcome, Score
 from napf_mpc.formation import PathFrame
+from napf_mpc.planners.tally import Tally
 from napf_mpc.problem import GoalMission, Problem
 from napf_mpc.store import Columns
 from napf_mpc.words import shown_text
@@ -94,7 +95,8 @@ def walk_block(problem: Problem, planner: str, seed: int, run: int, obstacles: O
     timing = timing_row(planner, range(run, run + 1), time.perf_counter() - began)
     points = np.column_stack([walk.positions, np.zeros(len(walk.positions))])
     rows = score_rows(planner, seed, _score(problem, run, walk.arrived, points, obstacles))
-    return Block(rows, timing, _trajectory(planner, run, points))
+    no_events = Tally.none(1).event_columns(planner, run)
+    return Block(rows, timing, _trajectory(planner, run, points), no_events)
 
 
 def _score(problem: Problem, run: int, arrived: bool, points: Array, obstacles: ObstacleSet) -> Score:

@@ -114,6 +114,7 @@ def fly_mission(
         mission = _flown(block, origin, obstacles)
         store.write_table(out / "runs.parquet", block.rows)
         store.write_table(out / "timing.parquet", block.timing)
+        store.write_table(out / "events.parquet", block.events)
         store.write_table(out / "trajectories.parquet", block.trajectories)
         write_scenario(out / "scenario.json", problem, seed, range(run, run + 1), data_folder)
         store.write_json(out / "summary.json", mission.summary)

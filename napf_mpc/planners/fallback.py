@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
+
+from napf_mpc.planners.tally import Event
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -19,7 +20,7 @@ DESCEND_AFTER_S = 30.0
 DESCENT_MPS = 0.5
 """Speed of that descent [m/s]."""
 MOST_EVENTS = 10_000
-"""Events that are kept one by one; all are counted."""
+"""Events of a block that are kept one by one; all uses are counted."""
 
 
 class Action(IntEnum):
@@ -33,22 +34,6 @@ class Action(IntEnum):
     """Brake and hold the place."""
     DESCEND = 3
     """Hold the place and go down."""
-
-
-@dataclass(frozen=True)
-class Event:
-    """One step down the ladder."""
-
-    time_s: float
-    """When [s]."""
-    run: int
-    """Run within the block."""
-    uav: int
-    """UAV."""
-    cause: str
-    """Why the new plan was refused."""
-    action: Action
-    """What flies instead."""
 
 
 class Ladder:
@@ -67,7 +52,7 @@ class Ladder:
         self._last: Codes = np.zeros((runs, uavs), dtype=np.int8)
 
     def decide(
-        self, time_s: float, accepted: Mask, age_s: Array, clear: Mask, causes: NDArray[np.str_]
+        self, time_s: float, accepted: Mask, age_s: Array, clear: Mask, causes: NDArray[np.object_]
     ) -> Codes:
         """Choose what each UAV flies.
 
@@ -100,6 +85,6 @@ class Ladder:
         for run, uav in np.argwhere(changed).tolist():
             if len(self.events) < MOST_EVENTS:
                 taken = Action(int(action[run, uav]))
-                self.events.append(Event(time_s, run, uav, str(causes[run, uav]), taken))
+                self.events.append(Event(time_s, run, uav, str(causes[run, uav]), taken.name.lower()))
         self._last = action
         return action

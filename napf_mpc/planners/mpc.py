@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,7 @@ SLOT_PART, OPENING_MPS = 0.7, 1.0
 """What is asked of neighbours at most: this part of the distance of their slots, and no faster parting."""
 SPEED_PRICE = (1000.0, 1000.0)
 """Prices of a speed slack: above what the margins can gain by it, so that no margin buys a dash."""
-_CAUSES = np.array([reason.name.lower() for reason in Refusal])
+_CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
 _WORDS = np.array([status.value for status in STATUSES])
 
 
@@ -145,7 +146,7 @@ class QpPlanner:
         if self._guidance is not None:
             self._guidance.reset(obstacles, runs)
         self.ladder = Ladder(runs, uavs)
-        self.tally = Tally.none(runs)
+        self.tally = replace(Tally.none(runs), events=self.ladder.events)
 
     def build(self, nav: NavSolution, time_s: float) -> HorizonQp:
         """Programs of this step, in coordinates whose origin is each UAV's reported position."""
@@ -172,7 +173,10 @@ class QpPlanner:
         refused = refusals(answer, self._limits)
         upset = np.abs(state[..., 6:10:2]).max(-1) > UPSET_RAD
         accepted = (refused == Refusal.NONE) & trusted & ~upset & (not late)
-        causes = np.where(upset, "upset", np.where(late, "late", _CAUSES[refused]))
+        words = _CAUSES[refused]
+        for place, message in answer.messages.items():
+            words[place] = f"{words[place]}: {message}"
+        causes = np.where(upset, "upset", np.where(late, "late", words))
         causes = np.where(trusted, causes, np.where(airborne, "navigation", ""))
         flown, action = self._choose(time_s, state, answer, accepted, trusted & ~upset, causes)
         self._plan, self._answer = flown, answer
@@ -279,7 +283,7 @@ class QpPlanner:
         answer: BatchResult,
         accepted: Mask,
         sound: Mask,
-        causes: NDArray[np.str_],
+        causes: NDArray[np.object_],
     ) -> tuple[Plan, Codes]:
         """Plans that fly from now on, and by which rung of the ladder."""
         old, step_s = self._plan, self._model.step_s

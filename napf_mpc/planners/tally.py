@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,22 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
+class Event:
+    """One step down the ladder."""
+
+    time_s: float
+    """When [s]."""
+    run: int
+    """Run within the block."""
+    uav: int
+    """UAV."""
+    cause: str
+    """Why the new plan was refused."""
+    action: str
+    """What flies instead, a name of :data:`FALL_BACKS`."""
+
+
+@dataclass(frozen=True)
 class Tally:
     """Counts of each run of a block."""
 
@@ -33,6 +50,9 @@ class Tally:
     """Name of :data:`COLUMNS` -> (run,)."""
     largest_slack_m: Array
     """(run,) most that a flown plan is inside an obstacle's margin, NaN if none was asked for [m]."""
+
+    events: list[Event] = field(default_factory=list)
+    """Every time that a UAV took to a fall-back, or to another one; runs count from the block's first."""
 
     @classmethod
     def none(cls, runs: int) -> Tally:
@@ -42,6 +62,18 @@ class Tally:
     def columns(self) -> dict[str, NDArray[np.int64] | Array]:
         """Columns of ``runs.parquet``."""
         return {**self.counts, "largest_slack_m": self.largest_slack_m}
+
+    def event_columns(self, planner: str, first_run: int) -> dict[str, NDArray[Any]]:
+        """Columns of ``events.parquet``."""
+        events = self.events
+        return {
+            "planner": np.full(len(events), planner, dtype=f"<U{max(1, len(planner))}"),
+            "run": np.array([first_run + event.run for event in events], dtype=np.int64),
+            "t_s": np.array([event.time_s for event in events], dtype=np.float64),
+            "uav": np.array([event.uav for event in events], dtype=np.int64),
+            "cause": np.array([event.cause for event in events], dtype=np.str_),
+            "action": np.array([event.action for event in events], dtype=np.str_),
+        }
 
     def add(self, name: str, uavs: Mask, amount: NDArray[np.int64] | int = 1) -> None:
         """Count UAVs (run, uav), once each or by an amount (run, uav)."""
