@@ -50,7 +50,7 @@ TIMES = dict(zip((2.0, 10.0, 50.0), (VERMILION, BLUE, GREEN), strict=True))
 # moment is computed, not simulated (`first_passage_probability`), and `mission_k` is the inverse.
 
 # %%
-levels = np.linspace(0.5, 4.0, 71)
+levels = np.linspace(0.5, 4.0, 15)
 with house_style():
     figure, axes = plt.subplots(figsize=(4.6, 3.0), layout="constrained")
     for tau, colour in TIMES.items():
