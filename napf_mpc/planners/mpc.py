@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
 from napf_mpc.constraints.limits import RotorLimits, SpeedLimit, TiltLimit
+from napf_mpc.constraints.moving import MovingObstacleContact
 from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
@@ -52,6 +53,9 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     neighbours = min(NEIGHBOURS, problem.uav_count - 1)
     apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
     others: list[Constraint] = [apart] if neighbours else []
+    if problem.world.moving:
+        count = min(rows, len(problem.world.moving))
+        others.append(MovingObstacleContact(obstacles=count, w1=price, extra_m=settings.contact_extra_m))
     speed = SpeedLimit(w1=SPEED_PRICE[0], w2=SPEED_PRICE[1])
     return [contact, influence, *others, speed, TiltLimit(), RotorLimits()]
 
@@ -218,6 +222,7 @@ class QpPlanner:
             obstacles=self._obstacles,
             frame=self._frame,
             problem=self.problem,
+            tracks=nav.tracks,
         )
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
@@ -310,7 +315,7 @@ class QpPlanner:
         """Most that each new plan (run, uav) is inside an obstacle's margin, NaN without one [m]."""
         most = np.full(accepted.shape, np.nan)
         for constraint, slack in zip(self.constraints, answer.slacks, strict=True):
-            if isinstance(constraint, ObstacleContact):
+            if isinstance(constraint, ObstacleContact | MovingObstacleContact):
                 most = np.fmax(most, slack.max(axis=(2, 3), initial=0.0))
         return np.where(accepted, most, np.nan)
 
