@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.problem import World
 from napf_mpc.streams import NormalSequence, Stream
-from napf_mpc.world.moving import HOLD_S, MovingObstacles
+from napf_mpc.world.moving import HOLD_S, MovingObstacles, round_distance
 
 Array = NDArray[np.float64]
 
@@ -69,6 +69,22 @@ class Tracks:
         covariance = p[..., :3, :3] + t * (p[..., :3, 3:] + p[..., 3:, :3]) + t * t * p[..., 3:, 3:]
         grown = self.acceleration_sigma_mps2**2 * HOLD_S * t**3 / 3.0
         return position, covariance + grown * np.eye(3)
+
+    def least_distance(self, points: Array, ahead_s: Array) -> Array:
+        """Least signed distance (run, uav) of points (run, uav, N, 3) to where all are expected then [m].
+
+        Parameters
+        ----------
+        points : array, shape (run, uav, N, 3)
+            [m].
+        ahead_s : array, shape (N,)
+            Times of the points from now [s].
+        """
+        centres = self.position[:, :, None] + self.velocity[:, :, None] * ahead_s[:, None]
+        distance, _ = round_distance(
+            points[:, :, :, None], centres.transpose(0, 2, 1, 3)[:, None], self.radius, self.upright
+        )
+        return np.asarray(distance.min(axis=(2, 3), initial=np.inf))
 
     def faults(self, runs: int) -> list[str]:
         """What does not fit a number of runs or is not finite, in words."""

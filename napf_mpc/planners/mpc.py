@@ -15,6 +15,7 @@ from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainab
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
 from napf_mpc.planners.guide import Guide
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
@@ -136,6 +137,7 @@ class QpPlanner:
         self._solver.reset()
         self._plan: Plan | None = None
         self._answer: BatchResult | None = None
+        self._tracks: Tracks | None = None
         self._made_s: Array = np.full((runs, uavs), -np.inf)
         self._anchor: Array = np.repeat(self._lanes[None], runs, axis=0)
         self.ladder = Ladder(runs, uavs)
@@ -153,6 +155,7 @@ class QpPlanner:
         """Solve this step's programs and command what was accepted, or what the ladder says."""
         airborne = np.ones(nav.available.shape, dtype=bool) if nav.airborne is None else nav.airborne
         trusted = nav.trusted() & airborne
+        self._tracks = nav.tracks
         self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
         state = self._state(nav, trusted)
         reference = self._slots.over(
@@ -296,7 +299,11 @@ class QpPlanner:
         runs, uavs, stages = plan.states.shape[:3]
         points = np.ascontiguousarray(plan.states[..., POSITION].reshape(runs, uavs * stages, 3))
         distance = self._obstacles.signed_distance(points).reshape(runs, uavs, stages)
-        return np.asarray(distance.min(-1) - self.problem.vehicle.radius_m)
+        least = distance.min(-1)
+        if self._tracks is not None:
+            moving = self._tracks.least_distance(plan.states[..., POSITION], np.cumsum(plan.step_s))
+            least = np.minimum(least, moving)
+        return np.asarray(least - self.problem.vehicle.radius_m)
 
     def _count(
         self, answer: BatchResult, action: Codes, accepted: Mask, trusted: Mask, airborne: Mask
