@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
+from PIL import Image, ImageSequence
 
 from napf_mpc.block import Missions, simulate
 from napf_mpc.figures import draw_stored
 from napf_mpc.mission import fly_mission
+from napf_mpc.plot.animate import animation
 from napf_mpc.plot.flight import paths_figure
 from napf_mpc.plot.overview import Mission, overview_figure
 from napf_mpc.plot.states import distance_figure
@@ -77,11 +79,26 @@ def test_the_other_figures_take_them(flown: tuple[Problem, Missions, Track]) -> 
     assert sum(isinstance(patch, Circle) for patch in figure.axes[0].patches) == 3
 
 
+def test_an_animation_shows_them_in_every_frame(
+    flown: tuple[Problem, Missions, Track], tmp_path: Path
+) -> None:
+    """In the frame at 12 s the ball that is met then darkens the picture where it is."""
+    problem, missions, _ = flown
+    table = missions.trajectories
+    shown = {name: values[np.isin(table["t_s"], [11.5, 12.0])] for name, values in table.items()}
+    frames = {}
+    for name, moving in (("with", missions.scenario.moving), ("without", None)):
+        path = animation(problem, shown, NOTHING, tmp_path / f"{name}.gif", "apf", moving)
+        with Image.open(path) as picture:
+            frames[name] = [np.asarray(frame.convert("L")) for frame in ImageSequence.Iterator(picture)]
+    assert len(frames["with"]) == len(frames["without"]) == 2
+    for mine, other in zip(frames["with"], frames["without"], strict=True):
+        assert 50 < (np.abs(mine.astype(int) - other) > 30).sum() < 0.2 * mine.size
+
+
 def test_stored_missions_are_drawn_with_them(tmp_path: Path) -> None:
     problem = load_problem("crossing_traffic", ["mission.length_m=16"])
     fly_mission(problem, "crossing", "napf", seed=1, run=2, out=tmp_path / "run")
     written = draw_stored(tmp_path / "run", tmp_path / "figures")
     (paths,) = (path for path in written if path.name == "crossing_napf_paths.svg")
-    assert (
-        "moving obstacle when nearest" in paths.read_text(encoding="utf-8")
-    )
+    assert "moving obstacle when nearest" in paths.read_text(encoding="utf-8")
