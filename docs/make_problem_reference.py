@@ -61,6 +61,7 @@ def tables(schema: Node) -> Iterator[str]:
 
 def _section(node: Node, section: str, definitions: Node, heading: str) -> Iterator[str]:
     kinds = _kinds(node, definitions)
+    told: list[Node] = []  # what every kind has is told once, below the first
     for model in kinds:
         properties: Node = model["properties"]
         tag = next((name for name in TAGS if "const" in properties.get(name, {})), None)
@@ -74,7 +75,8 @@ def _section(node: Node, section: str, definitions: Node, heading: str) -> Itera
             {key: value for key, value in properties.items() if key != tag}, model.get("required", [])
         )
         for key, value in properties.items():
-            if "items" in value and "oneOf" in value["items"]:
+            if "items" in value and "oneOf" in value["items"] and value["items"] not in told:
+                told.append(value["items"])
                 yield from _section(value["items"], f"an entry of `{key}`", definitions, heading + "#")
 
 

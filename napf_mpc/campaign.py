@@ -40,6 +40,8 @@ BLOCK_FIXES = 4_000_000
 """Position fixes drawn at a time, at most: about half a gigabyte."""
 BLOCK_OBSTACLES = 1_000_000
 """Obstacles of all runs of a block, at most."""
+BLOCK_MOVING = 20_000
+"""Moving obstacles of all runs of a block, at most: each has noise and accelerations of its own."""
 BLOCK_SAMPLES = 200_000
 """Rows of trajectories of a block, at most: about 60 megabytes."""
 WORTH_A_WORKER = 32
@@ -202,6 +204,7 @@ def block_size(
         BLOCK_UAVS // uavs,
         int(BLOCK_FIXES / (uavs * (limit_s * problem.navigation.rate_hz + 1.0))),
         BLOCK_OBSTACLES // max(1, len(scenario.obstacles.solids.kind)),
+        BLOCK_MOVING // max(1, len(problem.world.moving)),
         max(WORTH_A_WORKER, -(-runs // workers)),
     ]
     if record_every:

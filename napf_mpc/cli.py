@@ -170,7 +170,7 @@ def run(
     if out is not None:
         from napf_mpc.figures import draw_mission
 
-        draw_mission(problem, name, flown.trajectories, flown.obstacles, [kind], out, animation)
+        draw_mission(problem, name, flown.trajectories, flown.obstacles, [kind], out, animation, flown.moving)
     _end(flown.summary, out, quiet, as_json)
     raise typer.Exit(0 if flown.reached else 1)
 

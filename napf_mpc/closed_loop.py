@@ -21,12 +21,14 @@ from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.navigation.error_models import Fix, PositionErrors, position_errors
 from napf_mpc.navigation.filtered import FilteredNavigation
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.navigation.tracks import MovingTracker
 from napf_mpc.planners.planner import Command, Planner
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.vehicle.lqr import check_sampled_loop
 from napf_mpc.vehicle.plant import advance
 from napf_mpc.vehicle.quadrotor import parameters
 from napf_mpc.vehicle.tracking import TrackingLaw, tracking_law
+from napf_mpc.world.moving import MovingObstacles, moving_obstacles
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.scenes import build_scenes
 
@@ -53,6 +55,8 @@ class Scenario:
     """(run, uav, 12), Eq. 1."""
     errors: PositionErrors
     """Navigation errors over the whole mission."""
+    moving: MovingObstacles | None = None
+    """What moves, in truth; planners see its tracks only."""
 
 
 def formation_mission(problem: Problem) -> FormationMission:
@@ -106,6 +110,7 @@ def build_scenario(problem: Problem, seed: int, runs: range, data_folder: Path |
         position_errors(
             problem.navigation, seed, runs, problem.uav_count, problem.simulation.time_limit_s, data_folder
         ),
+        moving_obstacles(problem.world, seed, runs, problem.simulation.time_limit_s),
     )
 
 
@@ -181,6 +186,7 @@ def closed_loop(
     duration = np.zeros(runs)
     planner.reset(scenario.obstacles, runs)
     filtered = _filtered(problem, scenario, clock)
+    tracker = _tracker(problem, scenario, clock)
     fix = scenario.errors.fix(0)
     covariance = _with_velocity(fix.covariance)
     command: Command | None = None
@@ -201,9 +207,12 @@ def closed_loop(
                 fix = scenario.errors.fix(tick // clock.ticks_per_fix)
                 covariance = _with_velocity(fix.covariance)
             nav = _solution(time_s, state, fix, covariance)
+        if tracker is not None:
+            tracker.tick(tick)
         if command is None or tick % clock.ticks_per_plan == 0:
             airborne = np.repeat(active[:, None], state.shape[1], axis=1)
-            command = planner.step(replace(nav, airborne=airborne), time_s)
+            tracks = None if tracker is None else tracker.tracks()
+            command = planner.step(replace(nav, airborne=airborne, tracks=tracks), time_s)
             holding[active] = command.holding[active].any(-1)
             if command.reason is not None:
                 reason[active] = command.reason[active].max(-1)
@@ -282,6 +291,12 @@ def _filtered(problem: Problem, scenario: Scenario, clock: _Clock) -> FilteredNa
         clock.ticks_per_fix,
         scenario.initial_state[..., VELOCITY],
     )
+
+
+def _tracker(problem: Problem, scenario: Scenario, clock: _Clock) -> MovingTracker | None:
+    if scenario.moving is None:
+        return None
+    return MovingTracker(problem.world, scenario.moving, scenario.seed, scenario.runs, clock.period_s)
 
 
 def _with_velocity(covariance: Array) -> Array:

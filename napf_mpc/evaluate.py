@@ -19,6 +19,7 @@ from napf_mpc.problem import Problem
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.vehicle.quadrotor import hover_input
 from napf_mpc.world.distance import COS, SIN, Solids, X, Y, solid_bounds
+from napf_mpc.world.moving_sweep import MovingClearance
 from napf_mpc.world.sweep import SweptClearance, swept_separation
 
 Array = NDArray[np.float64]
@@ -94,7 +95,7 @@ class MissionScore:
     problem : Problem
         Formation mission, sizes and bounds.
     scenario : Scenario
-        Its obstacles are the solids of the verdict.
+        Its obstacles are the solids of the verdict, those that stand and those that move.
     """
 
     def __init__(self, problem: Problem, scenario: Scenario) -> None:
@@ -105,6 +106,8 @@ class MissionScore:
         self._offsets = formation_offsets(problem.formation)
         runs, uavs = scenario.initial_state.shape[:2]
         self._clearance = SweptClearance(scenario.obstacles, runs, uavs)
+        moving = scenario.moving
+        self._moving = None if moving is None else MovingClearance(moving, runs, uavs)
         self._separation = np.full((runs, uavs), np.inf)
         self._flown = np.zeros((runs, uavs))
         self._start = self._frame.along_track(scenario.initial_state[..., POSITION])
@@ -141,6 +144,8 @@ class MissionScore:
         p0 = np.ascontiguousarray(before[..., POSITION])
         p1 = np.ascontiguousarray(after[..., POSITION])
         self._clearance.update(p0, p1, active)
+        if self._moving is not None:
+            self._moving.update(time_s - self._problem.simulation.step_s, time_s, p0, p1, active)
         if time_s > APART_S and p0.shape[1] > 1:
             nearest = swept_separation(p0, p1)
             np.minimum(self._separation, nearest, out=self._separation, where=active[:, None])
@@ -190,7 +195,10 @@ class MissionScore:
     def score(self, flight: Flight) -> Score:
         """Verdicts and metrics once the block has flown."""
         vehicle = self._problem.vehicle
-        obstacle = self._clearance.contact(vehicle.radius_m)
+        clearance = self._clearance.clearance
+        if self._moving is not None:
+            clearance = np.minimum(clearance, self._moving.clearance)
+        obstacle = clearance <= vehicle.radius_m
         separation = self._separation.min(-1)
         uav = separation < vehicle.min_separation_m
         collided = obstacle.any(-1) | uav
@@ -224,7 +232,7 @@ class MissionScore:
                 "control_effort": self._sums[:, _EFFORT].copy(),
                 "reform_time_s": self._reform_time.copy(),
                 "finish_time_s": flight.finish_time_s.copy(),
-                "min_clearance_m": _finite_or_nan(self._clearance.clearance.min(-1) - vehicle.radius_m),
+                "min_clearance_m": _finite_or_nan(clearance.min(-1) - vehicle.radius_m),
                 "min_separation_m": _finite_or_nan(separation),
                 "within_k_sigma_east": self._sums[:, _WITHIN] / self._sums[:, _FIXES],
                 "within_k_sigma_north": self._sums[:, _WITHIN + 1] / self._sums[:, _FIXES],

@@ -14,7 +14,8 @@ from napf_mpc.errors import DataError
 from napf_mpc.plot.field import surface_figure, walk_figure
 from napf_mpc.plot.style import credit_of, house_style, save
 from napf_mpc.problem import FormationMission, Problem
-from napf_mpc.scenario_file import read_scenes, scenes_of
+from napf_mpc.scenario_file import moving_of, read_moving, read_scenes, scenes_of
+from napf_mpc.world.moving import MovingObstacles
 from napf_mpc.world.obstacles import ObstacleSet
 
 SHOWN_EACH = 1
@@ -29,6 +30,7 @@ def draw_mission(
     planners: Sequence[str],
     out: Path,
     animated: bool = False,
+    moving: MovingObstacles | None = None,
 ) -> list[Path]:
     """Draw one mission, or a point's walk to its goal.
 
@@ -48,6 +50,8 @@ def draw_mission(
         Folder.
     animated : bool
         Whether to make an animation too (some ten seconds).
+    moving : MovingObstacles, optional
+        What moved there, in truth.
     """
     if not isinstance(problem.mission, FormationMission):
         with house_style():
@@ -55,11 +59,11 @@ def draw_mission(
                 *save(surface_figure(problem, obstacles), out, f"{name}_potential"),
                 *save(walk_figure(problem, obstacles), out, f"{name}_walk"),
             ]
-    written = plot.run_figures(problem, name, trajectories, obstacles, list(planners), out)
+    written = plot.run_figures(problem, name, trajectories, obstacles, list(planners), out, moving)
     if animated:
         for planner in planners:
             path = out / f"{name}_{planner}.gif"
-            written.append(plot.animation(problem, trajectories, obstacles, path, planner))
+            written.append(plot.animation(problem, trajectories, obstacles, path, planner, moving))
     return written
 
 
@@ -111,8 +115,11 @@ def draw_comparison(
     def obstacles_of(run: int) -> ObstacleSet:
         return scenes_of(problem, summary["seed"], range(run, run + 1), data_folder)
 
-    name = str(summary["problem"])
-    return written + plot.paths_overview(problem, name, store.stack(tracks), obstacles_of, missions, out)
+    def moving_in(run: int) -> MovingObstacles | None:
+        return moving_of(problem, summary["seed"], range(run, run + 1))
+
+    name, flown = str(summary["problem"]), store.stack(tracks)
+    return written + plot.paths_overview(problem, name, flown, obstacles_of, missions, out, moving_in)
 
 
 def _planner_ticks(problem: Problem) -> int:
@@ -144,7 +151,7 @@ def draw_stored(
     if "run" in summary:
         trajectories = store.read_table(folder / "trajectories.parquet")
         (shapes,) = read_scenes(folder / "scenario.json").values()
-        return draw_mission(
-            problem, name, trajectories, ObstacleSet.from_shapes(shapes), planners, out, animated
-        )
+        moving = next(iter(read_moving(folder / "scenario.json").values()), None)
+        obstacles = ObstacleSet.from_shapes(shapes)
+        return draw_mission(problem, name, trajectories, obstacles, planners, out, animated, moving)
     return draw_comparison(problem, summary, store.read_table(folder / "runs.parquet"), out, data_folder)

@@ -16,9 +16,10 @@ from napf_mpc.goal_walk import walk_block
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.provenance import data_digests, identity
-from napf_mpc.scenario_file import scenes_of, write_scenario
+from napf_mpc.scenario_file import moving_of, scenes_of, write_scenario
 from napf_mpc.summary import summarise
 from napf_mpc.words import shown_value
+from napf_mpc.world.moving import MovingObstacles
 from napf_mpc.world.obstacles import ObstacleSet
 
 
@@ -34,6 +35,8 @@ class FlownMission:
     """Every tick of it."""
     obstacles: ObstacleSet
     """What it flew through."""
+    moving: MovingObstacles | None = None
+    """What moved there, in truth."""
 
     @property
     def reached(self) -> bool:
@@ -107,11 +110,12 @@ def fly_mission(
         )
     origin = identity(problem, name, [planner], seed, data_folder) | {"run": run}
     obstacles = scenes_of(problem, seed, range(run, run + 1), data_folder)
+    moving = moving_of(problem, seed, range(run, run + 1))
     if out is None:
-        return _flown(_fly(problem, planner, seed, run, obstacles, data_folder), origin, obstacles)
+        return _flown(_fly(problem, planner, seed, run, obstacles, data_folder), origin, obstacles, moving)
     with taken(out, origin):
         block = _fly(problem, planner, seed, run, obstacles, data_folder)
-        mission = _flown(block, origin, obstacles)
+        mission = _flown(block, origin, obstacles, moving)
         store.write_table(out / "runs.parquet", block.rows)
         store.write_table(out / "timing.parquet", block.timing)
         store.write_table(out / "events.parquet", block.events)
@@ -129,7 +133,9 @@ def _fly(
     return walk_block(problem, planner, seed, run, obstacles)
 
 
-def _flown(block: Block, origin: dict[str, Any], obstacles: ObstacleSet) -> FlownMission:
+def _flown(
+    block: Block, origin: dict[str, Any], obstacles: ObstacleSet, moving: MovingObstacles | None
+) -> FlownMission:
     row = {key: values[0].item() for key, values in block.rows.items()}
     summary = summarise(block.rows, origin) | {"run": origin["run"], "outcome": row["outcome"]}
-    return FlownMission(row, summary, block.trajectories, obstacles)
+    return FlownMission(row, summary, block.trajectories, obstacles, moving)

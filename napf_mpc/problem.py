@@ -30,6 +30,9 @@ __all__ = [
     "Line",
     "Listed",
     "Mission",
+    "MovingCylinder",
+    "MovingObstacle",
+    "MovingSphere",
     "Navigation",
     "ObstacleItem",
     "ObstacleList",
@@ -52,6 +55,7 @@ Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
 Point2 = tuple[Coordinate, Coordinate]
 Point3 = tuple[Coordinate, Coordinate, Coordinate]
 Speed = Annotated[float, Field(ge=-100.0, le=100.0)]
+Velocity2 = tuple[Speed, Speed]
 Velocity3 = tuple[Speed, Speed, Speed]
 InitialPosition = Point3
 Size = Annotated[float, Field(ge=0.01, le=1e5)]
@@ -323,14 +327,59 @@ ObstacleItem = Annotated[
 ]
 
 
-class EmptyWorld(_Section):
+class _Moving(_Section):
+    acceleration_sigma_mps2: float = Field(0.0, ge=0.0, le=20.0)
+    """Sigma of its true acceleration on each axis, drawn anew every second; 0 moves evenly and straight."""
+
+
+class MovingSphere(_Moving):
+    """A ball that moves."""
+
+    shape: Literal["sphere"]
+    """Name of the shape."""
+    start_m: Point3
+    """Centre at the start of the mission: east, north, up."""
+    velocity_mps: Velocity3
+    """Velocity at the start: east, north, up."""
+    radius_m: Size
+    """Radius."""
+
+
+class MovingCylinder(_Moving):
+    """A vertical cylinder without ends that moves in the plane: a vehicle that nobody may fly over."""
+
+    shape: Literal["cylinder"]
+    """Name of the shape."""
+    start_m: Point2
+    """Axis at the start of the mission: east, north."""
+    velocity_mps: Velocity2
+    """Velocity at the start: east, north."""
+    radius_m: Size
+    """Radius."""
+
+
+MovingObstacle = Annotated[MovingSphere | MovingCylinder, Field(discriminator="shape")]
+
+
+class _WorldBase(_Section):
+    moving: Annotated[tuple[MovingObstacle, ...], Field(max_length=1000)] = ()
+    """Moving obstacles, the same in every run but for their accelerations; they pass through everything."""
+    moving_sigma_m: float = Field(0.2, ge=1e-3, le=1e3)
+    """Sigma of an observation of a moving obstacle's centre on each axis, white."""
+    moving_rate_hz: float = Field(10.0, ge=0.1, le=100.0)
+    """Rate at which moving obstacles are observed, all of them each time."""
+    moving_acceleration_sigma_mps2: float = Field(0.3, ge=0.0, le=20.0)
+    """Acceleration that the tracker assumes of moving obstacles, drawn anew every second on each axis."""
+
+
+class EmptyWorld(_WorldBase):
     """Nothing to hit."""
 
     kind: Literal["empty"]
     """Kind of world."""
 
 
-class ObstacleList(_Section):
+class ObstacleList(_WorldBase):
     """Obstacles one by one."""
 
     kind: Literal["list"]
@@ -339,7 +388,7 @@ class ObstacleList(_Section):
     """The obstacles."""
 
 
-class _RandomWorld(_Section):
+class _RandomWorld(_WorldBase):
     count: Count
     """Number of obstacles."""
     radius_m: tuple[Size, Size] = (0.5, 2.0)
@@ -386,7 +435,7 @@ class Scatter(_RandomWorld):
     _range_ordered = field_validator("along_range_m", "lateral_range_m", "height_range_m")(_ordered)
 
 
-class Forest(_Section):
+class Forest(_WorldBase):
     """Tree trunks as vertical cylinders, at least a gap apart."""
 
     kind: Literal["forest"]
@@ -411,7 +460,7 @@ class Forest(_Section):
     )
 
 
-class StreetCanyon(_Section):
+class StreetCanyon(_WorldBase):
     """A synthetic street: buildings of random size on both sides, masts in it."""
 
     kind: Literal["street_canyon"]
@@ -444,7 +493,7 @@ class StreetCanyon(_Section):
     )(_ordered)
 
 
-class City(_Section):
+class City(_WorldBase):
     """Buildings from a file: GeoJSON footprints with heights, or CityJSON LoD1."""
 
     kind: Literal["city"]
@@ -740,6 +789,8 @@ class Problem(_Section):
             faults.append(
                 f'planner.kind = "{self.planner.kind}", a mission of kind goal is flown by "apf" only'
             )
+        if isinstance(self.mission, GoalMission) and self.world.moving:
+            faults.append("world.moving: a mission of kind goal is a walk without time; leave it out")
         if faults:
             raise ValueError("; ".join(faults))
         return self
@@ -769,11 +820,14 @@ class Problem(_Section):
         """Each slower rate must divide the faster one, so that every loop is a whole number of steps."""
         faults = []
         controller_hz = self.simulation.controller_rate_hz
-        for name, fast_hz, slow_hz in (
+        rates = [
             ("simulation.controller_rate_hz", 1.0 / self.simulation.step_s, controller_hz),
             ("planner.rate_hz", controller_hz, self.planner.rate_hz),
             ("navigation.rate_hz", controller_hz, self.navigation.rate_hz),
-        ):
+        ]
+        if self.world.moving:
+            rates.append(("world.moving_rate_hz", controller_hz, self.world.moving_rate_hz))
+        for name, fast_hz, slow_hz in rates:
             ratio = fast_hz / slow_hz
             if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-6 * ratio:
                 faults.append(f"{name} = {slow_hz:g} must divide {fast_hz:g} Hz a whole number of times")

@@ -15,6 +15,7 @@ from napf_mpc.errors import DataError
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.goal_walk import goal_scenes
 from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.world.moving import MovingObstacles, moving_obstacles
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.scenes import build_scenes
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
@@ -41,6 +42,11 @@ def scenes_of(
         return goal_scenes(problem, seed, runs, data_folder)
     lanes = formation_offsets(problem.formation)[:, 1]
     return build_scenes(problem.world, PathFrame.of_mission(mission), lanes, seed, runs, data_folder)
+
+
+def moving_of(problem: Problem, seed: int = 0, runs: range = range(1)) -> MovingObstacles | None:
+    """Moving obstacles of some runs of a campaign, in truth; None in a world without any."""
+    return moving_obstacles(problem.world, seed, runs, problem.simulation.time_limit_s)
 
 
 def shape_to_json(shape: Shape) -> dict[str, Any]:
@@ -95,6 +101,9 @@ def write_scenario(
 ) -> None:
     """Write problem, seed, initial state and the obstacles of every run, up to 400,000 obstacles.
 
+    What moves is written with start, velocity and the acceleration of each second, by which its true place
+    is known at any time (:mod:`napf_mpc.world.moving`); up to 400,000 of those accelerations.
+
     Parameters
     ----------
     path : Path
@@ -121,6 +130,8 @@ def write_scenario(
         "initial_state": _start(problem).tolist(),
         "scenes": _scenes(problem, seed, runs, data_folder),
     }
+    if problem.world.moving:
+        table["moving"] = _moving(problem, seed, runs)
     store.write_json(path, table, indent=None)
 
 
@@ -145,6 +156,86 @@ def _scenes(problem: Problem, seed: int, runs: range, data_folder: Path | None) 
             if written >= MAX_OBSTACLES:
                 return scenes
     return scenes
+
+
+def _moving(problem: Problem, seed: int, runs: range) -> list[dict[str, Any]]:
+    written, scenes = 0, []
+    for run in runs:
+        moving = moving_of(problem, seed, range(run, run + 1))
+        assert moving is not None
+        entry = {"run": run, "obstacles": moving_to_json(moving)}
+        if moving.acceleration.shape[2] == 0 and len(runs) > 1:
+            return [entry | {"run": None}]
+        scenes.append(entry)
+        written += moving.acceleration[0, :, :, 0].size
+        if written >= MAX_OBSTACLES:
+            break
+    return scenes
+
+
+def moving_to_json(moving: MovingObstacles) -> list[dict[str, Any]]:
+    """Moving obstacles of a single run as tables: as in ``world.moving``, and ``accelerations_mps2``."""
+    tables: list[dict[str, Any]] = []
+    for i in range(moving.count):
+        axes = 2 if moving.upright[i] else 3
+        tables.append(
+            {
+                "shape": "cylinder" if moving.upright[i] else "sphere",
+                "start_m": moving.start[i, :axes].tolist(),
+                "velocity_mps": moving.velocity[i, :axes].tolist(),
+                "radius_m": float(moving.radius[i]),
+                "accelerations_mps2": moving.acceleration[0, i, :, :axes].tolist(),
+            }
+        )
+    return tables
+
+
+def moving_from_json(tables: list[dict[str, Any]]) -> MovingObstacles:
+    """Moving obstacles of a single run from tables that :func:`moving_to_json` made.
+
+    Raises
+    ------
+    DataError
+        If a table is not one of ours.
+    """
+    try:
+        upright = np.array([{"sphere": False, "cylinder": True}[table["shape"]] for table in tables])
+        seconds = len(tables[0]["accelerations_mps2"])
+        acceleration = np.zeros((1, len(tables), seconds, 3))
+        for i, table in enumerate(tables):
+            axes = 2 if upright[i] else 3
+            held = np.array(table["accelerations_mps2"], dtype=float).reshape(-1, axes)
+            acceleration[0, i, :, :axes] = held
+        moving = MovingObstacles(
+            radius=np.array([float(table["radius_m"]) for table in tables]),
+            upright=upright,
+            start=np.array([(*table["start_m"], 0.0)[:3] for table in tables], dtype=float),
+            velocity=np.array([(*table["velocity_mps"], 0.0)[:3] for table in tables], dtype=float),
+            acceleration=acceleration,
+        )
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise DataError(f"scenario: not moving obstacles of ours: {error!r}") from error
+    if moving.start.shape != (moving.count, 3) or moving.velocity.shape != (moving.count, 3):
+        raise DataError(
+            "scenario: not moving obstacles of ours: start_m and velocity_mps have 2 or 3 entries"
+        )
+    return moving
+
+
+def read_moving(path: Path) -> dict[int | None, MovingObstacles]:
+    """Moving obstacles by run, in truth; key None holds those that all runs share; empty without any.
+
+    Raises
+    ------
+    DataError
+        If the file is not a scenario of ours.
+    """
+    table = store.read_json(path)
+    try:
+        scenes = table.get("moving", [])
+        return {scene["run"]: moving_from_json(scene["obstacles"]) for scene in scenes}
+    except (AttributeError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: not a scenario of ours: {error!r}") from error
 
 
 def _shapes(obstacles: ObstacleSet, scene: int) -> list[dict[str, Any]]:

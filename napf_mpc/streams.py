@@ -25,6 +25,8 @@ class Stream(IntEnum):
     GNSS_VELOCITY = 7
     ACCELEROMETER_BIAS = 8
     ACCELEROMETER_NOISE = 9
+    MOVING_ACCELERATION = 10
+    MOVING_OBSERVATION = 11
 
 
 def generator(seed: int, run: int, stream: Stream, uav: int = 0, axis: int = 0) -> np.random.Generator:
@@ -35,7 +37,7 @@ def generator(seed: int, run: int, stream: Stream, uav: int = 0, axis: int = 0) 
     seed : int
         Campaign seed, 0 <= seed < 2**63.
     run, uav, axis : int
-        Indices from zero.
+        Indices from zero; streams of moving obstacles count those instead of UAVs.
     stream : Stream
         What the numbers are for.
     """

@@ -80,7 +80,7 @@ def test_missions_on_the_overview_are_flown_again_to_the_bit(
 ) -> None:
     rows, summary = store.read_table(campaign / "runs.parquet"), store.read_json(campaign / "summary.json")
     draw_comparison(brief(), summary, rows, tmp_path)
-    _, name, tracks, obstacles_of, missions, _ = asked["paths_overview"]
+    _, name, tracks, obstacles_of, missions, _, moving_of = asked["paths_overview"]
     assert name == "brief"
     assert {mission.planner for mission in missions} == {"apf", "napf"}
     for shown in missions:
@@ -90,6 +90,7 @@ def test_missions_on_the_overview_are_flown_again_to_the_bit(
         shown_ticks = np.isin(flown.trajectories["t_s"], tracks["t_s"][ours])
         np.testing.assert_array_equal(tracks["x_m"][ours], flown.trajectories["x_m"][shown_ticks])
         assert obstacles_of(shown.run).shapes() == flown.obstacles.shapes()
+        assert moving_of(shown.run) is None
 
 
 def test_results_that_do_not_fly_as_they_did_are_not_drawn_as_if(
@@ -114,11 +115,12 @@ def test_the_scene_that_was_flown_is_the_one_that_is_drawn(
     mission: Path, tmp_path: Path, asked: dict[str, tuple[Any, ...]]
 ) -> None:
     draw_stored(mission, tmp_path)
-    problem, name, tracks, obstacles, planners, _ = asked["run_figures"]
+    problem, name, tracks, obstacles, planners, _, moving = asked["run_figures"]
     flown = fly_mission(brief(), "brief", "napf", seed=2, run=1)
     assert (problem, name, planners) == (brief(), "brief", ["napf"])
     assert obstacles.shapes() == flown.obstacles.shapes()
     np.testing.assert_array_equal(tracks["x_m"], flown.trajectories["x_m"])
+    assert moving is None
     assert "animation" not in asked
 
 
@@ -126,7 +128,7 @@ def test_an_animation_is_made_when_asked_for(
     mission: Path, tmp_path: Path, asked: dict[str, tuple[Any, ...]]
 ) -> None:
     written = draw_stored(mission, tmp_path, animated=True)
-    assert asked["animation"][3:] == (tmp_path / "brief_napf.gif", "napf")
+    assert asked["animation"][3:] == (tmp_path / "brief_napf.gif", "napf", None)
     assert Path("a.gif") in written
 
 

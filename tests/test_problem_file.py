@@ -24,6 +24,7 @@ SHIPPED = shipped_problems()
 NAMES = {
     "potential_surface", "single_uav", "square_8", "square_40", "street_canyon", "nishi_shinjuku",
     "table1_8", "table1_40", "table1_8c", "table1_40c", "study_8s", "study_40s", "study_8c", "study_40c",
+    "crossing_traffic",
 }  # fmt: skip
 SMALL = """
 [formation]
@@ -306,7 +307,9 @@ def test_folders_and_missing_files(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         load_problem(tmp_path)
     with pytest.raises(ProblemError, match=r"no such file.*did you mean table1_8"):
         load_problem("tabel1_8")
-    with pytest.raises(ProblemError, match=r"no such file.*shipped problems: nishi_shinjuku"):
+    with pytest.raises(
+        ProblemError, match=r"no such file.*shipped problems: crossing_traffic, nishi_shinjuku"
+    ):
         load_problem("zzz")
     for odd in ("", "a\0b", "x" * 5000, "\x1b[2J"):
         with pytest.raises(ProblemError) as caught:

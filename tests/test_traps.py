@@ -1,5 +1,6 @@
 """Ways in which such a simulation fools its author; one detector for each, named by what it would do."""
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -196,7 +197,7 @@ class Tape:
         self.inner.reset(obstacles, runs)
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
-        copies = {each.name: np.copy(getattr(nav, each.name)) for each in fields(NavSolution)[1:]}
+        copies = {each.name: copy.deepcopy(getattr(nav, each.name)) for each in fields(NavSolution)[1:]}
         self.given.append((time_s, NavSolution(nav.time_s, **copies)))
         command = self.inner.step(nav, time_s)
         self.answers.append(command)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.errors import NapfError
 from napf_mpc.formation import PathFrame
+from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.problem import Problem
 from napf_mpc.world.obstacles import ObstacleSet
 
@@ -55,6 +56,8 @@ class Horizon:
     """Frame of the mission's path."""
     problem: Problem
     """Sizes, speeds and settings."""
+    tracks: Tracks | None = None
+    """Moving obstacles as tracked now; None in a world without any."""
     memo: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
     """Answers that several constraints share, such as the nearest obstacles; dies with the horizon."""
 
@@ -88,6 +91,8 @@ class Horizon:
                 faults.append(f"{name} has shape {values.shape}, must be {want}")
             elif not np.isfinite(values).all():
                 faults.append(f"{name} has an entry that is not finite")
+        if self.tracks is not None:
+            faults += self.tracks.faults(shape[0])
         if not faults and not (self.step_s > 0.0).all():
             faults.append("step_s must be > 0")
         if len(shape) == 3 and self.obstacles.n_scenes not in (1, shape[0]):

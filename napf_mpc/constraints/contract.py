@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.constraints.constraint import Constraint, ConstraintError, Horizon, LinearRows
 from napf_mpc.formation import PathFrame, formation_offsets
+from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.streams import Stream, generator
 from napf_mpc.world.obstacles import ObstacleSet
@@ -99,6 +100,21 @@ def sample_horizon(
         obstacles=obstacles,
         frame=PathFrame.of_mission(problem.mission),
         problem=problem,
+        # From a stream of their own, so that what is drawn after does not depend on them.
+        tracks=sample_tracks(rng.spawn(1)[0], runs, spread_m=spread_m),
+    )
+
+
+def sample_tracks(rng: np.random.Generator, runs: int, count: int = 6, spread_m: float = 8.0) -> Tracks:
+    """Draw tracks of moving balls and cylinders near the origin, with covariances in all directions."""
+    root = rng.normal(size=(runs, count, 6, 6)) / 4.0
+    return Tracks(
+        position=spread_m * rng.normal(size=(runs, count, 3)),
+        velocity=3.0 * rng.normal(size=(runs, count, 3)),
+        covariance=np.einsum("...ij,...kj->...ik", root, root),
+        radius=rng.uniform(0.3, 2.0, count),
+        upright=np.arange(count) % 3 == 1,
+        acceleration_sigma_mps2=0.3,
     )
 
 
@@ -170,7 +186,10 @@ def check_constraint(
 
 
 def _arrays(horizon: Horizon) -> list[Array]:
-    return [horizon.step_s, horizon.position, horizon.velocity, horizon.covariance, horizon.common_factor]
+    tracks = horizon.tracks
+    seen = [] if tracks is None else [tracks.position, tracks.velocity, tracks.covariance, tracks.radius]
+    plans = [horizon.step_s, horizon.position, horizon.velocity, horizon.covariance, horizon.common_factor]
+    return plans + seen
 
 
 def _kind(rows: LinearRows) -> tuple[object, ...]:
@@ -207,7 +226,9 @@ def part_of(horizon: Horizon, run: int, uavs: slice = slice(None)) -> Horizon:
         name: getattr(horizon, name)[run : run + 1, uavs].copy()
         for name in ("position", "velocity", "covariance", "common_factor")
     }
-    return replace(horizon, obstacles=world.scene(run) if world.n_scenes > 1 else world, **cut)
+    tracks = None if horizon.tracks is None else horizon.tracks.of_run(run)
+    scene = world.scene(run) if world.n_scenes > 1 else world
+    return replace(horizon, obstacles=scene, tracks=tracks, **cut)
 
 
 def _part(rows: LinearRows, run: int, uavs: slice) -> LinearRows:

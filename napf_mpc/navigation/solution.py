@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.navigation.tracks import Tracks
+
 Array = NDArray[np.float64]
 
 
@@ -14,7 +16,7 @@ Array = NDArray[np.float64]
 class NavSolution:
     """One navigation solution of every UAV of every run, as reported.
 
-    A planner receives this type and the map, and nothing else, so it cannot peek at the truth.
+    A planner receives this type and the map of what stands, and nothing else, so it cannot peek at the truth.
     """
 
     time_s: float
@@ -35,6 +37,8 @@ class NavSolution:
     """(run, uav, 3, rank) factor L of the part that UAVs share: Sigma_ij = L_i L_j^T [m]."""
     airborne: NDArray[np.bool_] | None = None
     """(run, uav): whether the UAV still flies its mission, so a planner has to work for it; None for all."""
+    tracks: Tracks | None = None
+    """Moving obstacles as tracked now; None in a world without any."""
 
     @property
     def position_covariance(self) -> Array:

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
 from napf_mpc.constraints.limits import InputBox, SpeedLimit, TiltLimit
+from napf_mpc.constraints.moving import MovingObstacleContact
 from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
 from napf_mpc.planners.guidance import Guidance
 from napf_mpc.planners.guided_field import waiting_reasons
@@ -56,6 +58,9 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     neighbours = min(NEIGHBOURS, problem.uav_count - 1)
     apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
     others: list[Constraint] = [apart] if neighbours else []
+    if problem.world.moving:
+        count = min(rows, len(problem.world.moving))
+        others.append(MovingObstacleContact(obstacles=count, w1=price, extra_m=settings.contact_extra_m))
     speed = SpeedLimit(w1=SPEED_PRICE[0], w2=SPEED_PRICE[1])
     return [contact, influence, *others, speed, TiltLimit(), InputBox()]
 
@@ -141,6 +146,7 @@ class QpPlanner:
         self._solver.reset()
         self._plan: Plan | None = None
         self._answer: BatchResult | None = None
+        self._tracks: Tracks | None = None
         self._made_s: Array = np.full((runs, uavs), -np.inf)
         self._anchor: Array = np.repeat(self._lanes[None], runs, axis=0)
         if self._guidance is not None:
@@ -160,6 +166,7 @@ class QpPlanner:
         """Solve this step's programs and command what was accepted, or what the ladder says."""
         airborne = np.ones(nav.available.shape, dtype=bool) if nav.airborne is None else nav.airborne
         trusted = nav.trusted() & airborne
+        self._tracks = nav.tracks
         self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
         state = self._state(nav, trusted)
         covariance = np.where(trusted[..., None, None], nav.position_covariance, np.eye(3))
@@ -235,6 +242,7 @@ class QpPlanner:
             obstacles=self._obstacles,
             frame=self._frame,
             problem=self.problem,
+            tracks=nav.tracks,
         )
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
@@ -308,7 +316,11 @@ class QpPlanner:
         runs, uavs, stages = plan.states.shape[:3]
         points = np.ascontiguousarray(plan.states[..., POSITION].reshape(runs, uavs * stages, 3))
         distance = self._obstacles.signed_distance(points).reshape(runs, uavs, stages)
-        return np.asarray(distance.min(-1) - self.problem.vehicle.radius_m)
+        least = distance.min(-1)
+        if self._tracks is not None:
+            moving = self._tracks.least_distance(plan.states[..., POSITION], np.cumsum(plan.step_s))
+            least = np.minimum(least, moving)
+        return np.asarray(least - self.problem.vehicle.radius_m)
 
     def _count(
         self, answer: BatchResult, action: Codes, accepted: Mask, trusted: Mask, airborne: Mask
@@ -327,7 +339,7 @@ class QpPlanner:
         """Most that each new plan (run, uav) is inside an obstacle's margin, NaN without one [m]."""
         most = np.full(accepted.shape, np.nan)
         for constraint, slack in zip(self.constraints, answer.slacks, strict=True):
-            if isinstance(constraint, ObstacleContact):
+            if isinstance(constraint, ObstacleContact | MovingObstacleContact):
                 most = np.fmax(most, slack.max(axis=(2, 3), initial=0.0))
         return np.where(accepted, most, np.nan)
 

@@ -12,9 +12,11 @@ from napf_mpc import apf
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets, reference_speed, synchronisation_error
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.planner import Command
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.safety_distance import Inflation
+from napf_mpc.world.moving import round_distance
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -26,7 +28,8 @@ class PotentialFieldPlanner:
     Outside the range of influence it is pure formation motion: lane, synchronised speed (Eq. 18). Inside,
     the repulsion adds to the reference velocity (Eq. 37), the direction is held within the largest turn
     (Eq. 39), and the path point follows the UAV, so that the lateral tracking does not fight the avoidance.
-    UAVs do not repel each other.
+    UAVs do not repel each other. A moving obstacle repels from where it is tracked now, inflated by k sigma
+    of its place relative to the UAV.
 
     Parameters
     ----------
@@ -77,6 +80,9 @@ class PotentialFieldPlanner:
         )
         reference = speed[..., None] * self._frame.along
         force, avoiding = self._repulsion(position, covariance)
+        if nav.tracks is not None and nav.tracks.count:
+            away, near = self._moving_repulsion(position, covariance, nav.tracks)
+            force, avoiding = force + away, avoiding | near
         velocity = apf.velocity_update(reference, force, settings.max_speed_ratio * mission.speed_mps)
         direction = apf.limit_turn(
             velocity, self._frame.along, self._frame.left, math.radians(settings.max_turn_deg)
@@ -109,11 +115,28 @@ class PotentialFieldPlanner:
         reach = settings.influence_m + self.inflation.largest_margin(covariance)
         near = self._obstacles.near(position, reach + self.problem.vehicle.radius_m)
         margin = self.inflation.margin(covariance, near.gradient)
+        return self._force(near.distance, near.gradient, margin)
+
+    def _moving_repulsion(
+        self, position: Array, covariance: Array, tracks: Tracks
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Force of the moving obstacles on each UAV (run, uav, 3), and whether any is within its range."""
+        distance, gradient = round_distance(
+            position[:, :, None], tracks.position[:, None], tracks.radius, tracks.upright
+        )
+        relative = covariance[:, :, None] + tracks.position_covariance[:, None]
+        return self._force(
+            distance, gradient, self.inflation.margin(relative, gradient[..., None, :])[..., 0]
+        )
+
+    def _force(self, distance: Array, gradient: Array, margin: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Sum of the forces of obstacles (run, uav, m), and whether any is within its range."""
+        settings = self.problem.planner
         rho, influence = self.inflation.apply(
-            near.distance - self.problem.vehicle.radius_m, margin, settings.influence_m
+            distance - self.problem.vehicle.radius_m, margin, settings.influence_m
         )
         force = apf.repulsive_force(
-            rho, near.gradient, settings.repulsive_gain, influence, settings.min_distance_m
+            rho, gradient, settings.repulsive_gain, influence, settings.min_distance_m
         )
         return force, np.asarray((rho < influence).any(-1))
 

@@ -11,7 +11,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Circle, Ellipse
 from matplotlib.text import Text
 from numpy.typing import NDArray
 from PIL import Image
@@ -34,6 +34,7 @@ from napf_mpc.plot.tracks import Track, acting, contacts, first_run, inflation_o
 from napf_mpc.problem import Problem
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.store import output_folder, write_bytes
+from napf_mpc.world.moving import MovingObstacles
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -58,6 +59,7 @@ def animation(
     obstacles: ObstacleSet,
     out_path: Path,
     planner: str | None = None,
+    moving: MovingObstacles | None = None,
 ) -> Path:
     """Write a flight as an animated GIF: from above and from the side.
 
@@ -77,6 +79,8 @@ def animation(
         File to write, ``.gif``.
     planner : str, optional
         Whose flight; the first in the table unless given.
+    moving : MovingObstacles, optional
+        What moved in that run, drawn from above.
 
     Returns
     -------
@@ -96,7 +100,7 @@ def animation(
     flown = track(trajectories, planner or str(trajectories["planner"][0]), run)
     output_folder(out_path.parent)
     with house_style():
-        frames = _Film(problem, flown, obstacles).frames()
+        frames = _Film(problem, flown, obstacles, moving).frames()
     # One palette for all frames: what does not move is then the same and costs nothing.
     palette = _palette(frames[len(frames) // 2])
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
@@ -127,7 +131,10 @@ def _palette(picture: Image.Image) -> Image.Image:
 class _Film:
     """Everything that stands still is drawn once; frames restore it and draw what moves."""
 
-    def __init__(self, problem: Problem, flown: Track, obstacles: ObstacleSet) -> None:
+    def __init__(
+        self, problem: Problem, flown: Track, obstacles: ObstacleSet, moving: MovingObstacles | None
+    ) -> None:
+        self._moving = moving
         self._flown = flown
         self._inflation = inflation_of(problem, flown.planner)
         self._k = Inflation.of_problem(problem).k or 3.0
@@ -135,7 +142,7 @@ class _Film:
         self._frame = PathFrame.of_mission(formation_mission(problem))
         self._level = abs(self._frame.heading_rad) < 1e-9
         self._small = flown.uavs <= MOST_UAVS
-        self._contacts = contacts(flown, obstacles, problem.vehicle.radius_m)
+        self._contacts = contacts(flown, obstacles, problem.vehicle.radius_m, moving)
         inflates = self._small and self._inflation.k > 0.0 and self._inflation.mode == "shift"
         self._acting = acting(problem, flown, obstacles) if inflates and self._shapes else None
         self._canvas, self._plan, self._side, self._clock = self._still(problem, obstacles)
@@ -218,6 +225,10 @@ class _Film:
                 artist = scene.draw_inflated(self._plan, shape, margin, height, uav_colour(uav))
                 self._plan.draw_artist(artist)
                 artist.remove()
+        if self._moving is not None:
+            places = self._moving.position(float(flown.time_s[sample]))[0]
+            for place, radius in zip(places, self._moving.radius.tolist(), strict=True):
+                _once(self._plan, Circle((place[0], place[1]), radius, **scene.MOVING_STYLE))
         for uav in range(flown.uavs):
             colour = uav_colour(uav)
             if self._small:

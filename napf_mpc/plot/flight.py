@@ -36,10 +36,12 @@ from napf_mpc.plot.tracks import (
     encounters,
     first_run,
     inflation_of,
+    moving_distances,
     track,
 )
 from napf_mpc.problem import Problem
 from napf_mpc.safety_distance import Inflation
+from napf_mpc.world.moving import MovingObstacles
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -63,6 +65,7 @@ def run_figures(
     obstacles: ObstacleSet,
     planner_names: Sequence[str],
     out: Path,
+    moving: MovingObstacles | None = None,
 ) -> list[Path]:
     """Make the figures of one run: for each planner six figures, PNG and SVG.
 
@@ -80,6 +83,8 @@ def run_figures(
         Planners to draw.
     out : Path
         Output folder.
+    moving : MovingObstacles, optional
+        What moved in that run, in truth.
 
     Returns
     -------
@@ -99,11 +104,11 @@ def run_figures(
         for planner in planner_names:
             flown = track(trajectories, planner, run)
             figures = {
-                "paths": paths_figure(problem, flown, obstacles),
+                "paths": paths_figure(problem, flown, obstacles, moving=moving),
                 "uncertainty": uncertainty_figure(problem, flown, obstacles),
                 "motion": motion_figure(problem, flown),
                 "attitude": attitude_figure(problem, flown),
-                "distances": distance_figure(problem, flown, obstacles),
+                "distances": distance_figure(problem, flown, obstacles, moving),
                 "space": space_figure(problem, flown, obstacles),
             }
             for kind, figure in figures.items():
@@ -121,7 +126,11 @@ def flight_title(problem: Problem, flown: Track) -> str:
 
 
 def paths_figure(
-    problem: Problem, flown: Track, obstacles: ObstacleSet, beside: Sequence[Track] = ()
+    problem: Problem,
+    flown: Track,
+    obstacles: ObstacleSet,
+    beside: Sequence[Track] = (),
+    moving: MovingObstacles | None = None,
 ) -> Figure:
     """Paths of all UAVs from above and from the side, with every contact marked.
 
@@ -138,6 +147,8 @@ def paths_figure(
         One scene.
     beside : sequence of Track
         Other flights of the same problem whose figures are to have the same scales.
+    moving : MovingObstacles, optional
+        What moved in that run: drawn from above, each with its path and where it was when it came closest.
     """
     frame = PathFrame.of_mission(formation_mission(problem))
     level = abs(frame.heading_rad) < 1e-9
@@ -170,11 +181,13 @@ def paths_figure(
         axes.locator_params(axis="y", nbins=6, steps=[1, 2, 5, 10])
         axes.yaxis.set_label_coords(-0.42 / width, 0.5)
     scene.draw_plan(plan, obstacles, view)
+    if moving is not None:
+        draw_moving(plan, flown, moving)
     scene.draw_side(side, obstacles, frame, view, float(seen[:, 2].max()))
     draw_paths(plan, flown.position[..., 0], flown.position[..., 1], label=few)
     horizontal = flown.position[..., 0] if level else frame.along_track(flown.position)
     draw_paths(side, horizontal, flown.position[..., 2], label=False)
-    found = contacts(flown, obstacles, problem.vehicle.radius_m)
+    found = contacts(flown, obstacles, problem.vehicle.radius_m, moving)
     mark_contacts(plan, [(each.position[0], each.position[1]) for each in found])
     across = [each.position[0] if level else float(frame.along_track(each.position)) for each in found]
     mark_contacts(side, [(place, each.position[2]) for place, each in zip(across, found, strict=True)])
@@ -182,6 +195,8 @@ def paths_figure(
     handles: list[Any] = [scene.start_mark(), scene.end_mark()]
     if len(obstacles):
         handles.append(scene.obstacle_mark(obstacles))
+    if moving is not None:
+        handles.append(scene.moving_mark())
     if found:
         handles.append(scene.contact_mark())
     page.legend(handles, height - 0.02, x=left + 1.9)
@@ -219,6 +234,12 @@ def draw_paths(axes: Axes, x: Array, y: Array, label: bool) -> None:
         side = "right" if westward else "left"
         words = axes.text(place, height, f"UAV {uav + 1}", color=uav_colour(uav), va="center", ha=side)
         words.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.75})
+
+
+def draw_moving(axes: Axes, flown: Track, moving: MovingObstacles) -> None:
+    """Draw what moved from above, each where it was when it came closest to a UAV."""
+    nearest = moving_distances(flown.time_s, flown.position, moving).min(axis=1).argmin(axis=0)
+    scene.draw_moving(axes, moving, flown.time_s, flown.time_s[nearest])
 
 
 def mark_contacts(axes: Axes, places: Sequence[tuple[float, float]]) -> None:

@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from napf_mpc.plot import scene
-from napf_mpc.plot.flight import draw_paths, mark_contacts
+from napf_mpc.plot.flight import draw_moving, draw_paths, mark_contacts
 from napf_mpc.plot.states import uav_handles
 from napf_mpc.plot.style import PAGE_IN, Page, credit_of, house_style, planner_name, save
 from napf_mpc.plot.tracks import contacts, track
 from napf_mpc.problem import Problem
+from napf_mpc.world.moving import MovingObstacles
 from napf_mpc.world.obstacles import ObstacleSet
 
 
@@ -74,6 +75,7 @@ def paths_overview(
     obstacles_of_run: Callable[[int], ObstacleSet],
     missions: Sequence[Mission],
     out: Path,
+    moving_of_run: Callable[[int], MovingObstacles | None] = lambda run: None,
 ) -> list[Path]:
     """Make a page of top views, all to one scale, with every contact marked.
 
@@ -91,6 +93,8 @@ def paths_overview(
         What to show, in this order; see :func:`pick_missions`.
     out : Path
         Output folder.
+    moving_of_run : callable
+        Maps the index of a run to what moved in it.
 
     Returns
     -------
@@ -105,7 +109,7 @@ def paths_overview(
         If the folder cannot be written.
     """
     with house_style():
-        figure = overview_figure(problem, trajectories, obstacles_of_run, missions)
+        figure = overview_figure(problem, trajectories, obstacles_of_run, missions, moving_of_run)
         return save(figure, out, f"{name}_overview")
 
 
@@ -114,6 +118,7 @@ def overview_figure(
     trajectories: Mapping[str, NDArray[Any]],
     obstacles_of_run: Callable[[int], ObstacleSet],
     missions: Sequence[Mission],
+    moving_of_run: Callable[[int], MovingObstacles | None] = lambda run: None,
 ) -> Figure:
     """Top views of missions, all to one scale (see :func:`paths_overview`).
 
@@ -148,8 +153,11 @@ def overview_figure(
         axes.set_ylabel("North y (m)" if column == 0 else "")
         axes.tick_params(labelbottom=last, labelleft=column == 0)
         scene.draw_plan(axes, scenes[mission.run], view)
+        moving = moving_of_run(mission.run)
+        if moving is not None:
+            draw_moving(axes, flown, moving)
         draw_paths(axes, flown.position[..., 0], flown.position[..., 1], label=False)
-        found = contacts(flown, scenes[mission.run], problem.vehicle.radius_m)
+        found = contacts(flown, scenes[mission.run], problem.vehicle.radius_m, moving)
         mark_contacts(axes, [(contact.position[0], contact.position[1]) for contact in found])
         found_any |= bool(found)
         words = f": {mission.words}" if mission.words else ""

@@ -62,8 +62,10 @@ def paper_figures(
     if name not in FIRST_NUMBERS:
         planners = ("apf", "napf")
         flown = fly_block(problem, planners, seed, range(1), data_folder, EVERY)
-        obstacles = build_scenario(problem, seed, range(1), data_folder).obstacles
-        return run_figures(problem, name, flown.trajectories, obstacles, planners, out)
+        scenario = build_scenario(problem, seed, range(1), data_folder)
+        return run_figures(
+            problem, name, flown.trajectories, scenario.obstacles, planners, out, scenario.moving
+        )
 
     obstacles = build_scenario(problem, seed, range(1), data_folder).obstacles
     calm_first, rough_first = FIRST_NUMBERS[name]

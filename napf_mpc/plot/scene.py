@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from napf_mpc.formation import PathFrame
 from napf_mpc.plot.style import BLACK, GREY, PALE, RULE
 from napf_mpc.world.distance import BOX, PRISM
+from napf_mpc.world.moving import MovingObstacles
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 
@@ -33,6 +34,12 @@ SIGMA = "\N{NO-BREAK SPACE}\N{GREEK SMALL LETTER SIGMA}"
 """Goes after a number of sigmas."""
 DASHES = (0.0, (3.0, 1.5))
 """Line style of inflated obstacles."""
+MOVING_DASHES = (0.0, (1.0, 1.5))
+"""Line style of the paths of moving obstacles."""
+MOVING_STYLE: dict[str, Any] = {
+    "facecolor": PALE, "edgecolor": RULE, "linewidth": 0.6, "linestyle": MOVING_DASHES, "zorder": 1.3
+}  # fmt: skip
+"""A moving obstacle at one moment."""
 INFLATED_COLOUR = "#8A6D00"
 """Dashed outline of inflated obstacles: dark, and no UAV's colour."""
 
@@ -144,6 +151,22 @@ def draw_plan(axes: Axes, obstacles: ObstacleSet, view: View) -> None:
     if by_height:
         collection.set(array=np.minimum(upper[shown, 2], 1e6), cmap=height_colours(), norm=HEIGHT_SHADES)
     axes.add_collection(collection, autolim=False)
+
+
+def draw_moving(axes: Axes, moving: MovingObstacles, time_s: Array, met_s: Array) -> None:
+    """Draw what moves from above: its path over times (m,), and itself with its heading at times (n,)."""
+    paths = np.stack([moving.position(time)[0, :, :2] for time in time_s.tolist()])
+    for i, met in enumerate(met_s.tolist()):
+        axes.plot(*paths[:, i].T, color=GREY, linewidth=0.7, linestyle=MOVING_DASHES, zorder=1.2)
+        here, ahead = (moving.position(time)[0, i, :2] for time in (met, met + 1.0))
+        axes.add_patch(Circle((here[0], here[1]), float(moving.radius[i]), **MOVING_STYLE))
+        way = float(np.hypot(*(ahead - here)))
+        if way > 0.0:
+            tip = here + (ahead - here) * (float(moving.radius[i]) / way)
+            arrow = {"arrowstyle": "->", "color": RULE, "linewidth": 0.7, "shrinkA": 0.0, "shrinkB": 0.0}
+            axes.annotate(
+                "", (tip[0], tip[1]), (here[0], here[1]), arrowprops=arrow, annotation_clip=True, zorder=1.4
+            )
 
 
 def draw_side(axes: Axes, obstacles: ObstacleSet, frame: PathFrame, view: View, ceiling_m: float) -> None:
@@ -270,6 +293,11 @@ def inflated_mark(k: float) -> Line2D:
     """Legend entry for inflated obstacles."""
     words = f"obstacle + {k:.3g}{SIGMA}"
     return Line2D([], [], color=INFLATED_COLOUR, linewidth=0.7, linestyle=DASHES, label=words)
+
+
+def moving_mark() -> Patch:
+    """Legend entry for moving obstacles."""
+    return Patch(**MOVING_STYLE, label="moving obstacle when nearest")
 
 
 def obstacle_mark(obstacles: ObstacleSet) -> Patch:

@@ -23,6 +23,7 @@ from napf_mpc.plot.style import (
 )
 from napf_mpc.plot.tracks import Track, clearances, separations
 from napf_mpc.problem import Problem
+from napf_mpc.world.moving import MovingObstacles
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -167,13 +168,15 @@ def _share(panels: list[list[Axes]]) -> None:
             axes.tick_params(labelleft=column == 0)
 
 
-def distance_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figure:
+def distance_figure(
+    problem: Problem, flown: Track, obstacles: ObstacleSet, moving: MovingObstacles | None = None
+) -> Figure:
     """Clearance from the nearest obstacle and separation from the nearest UAV, with the lines of contact."""
     lone = flown.uavs == 1
     rows = 1 if lone else 2
     page, panels, height = _grid(rows, 1, COLUMN_IN, 1.3, 0.0, credit_of(problem))
     vehicle = problem.vehicle
-    clearance = clearances(flown, obstacles, vehicle.radius_m)
+    clearance = clearances(flown, obstacles, vehicle.radius_m, moving)
     axes = panels[0][0]
     far = FAR * problem.planner.influence_m
     _draw_distance(axes, flown.time_s, clearance, 0.0, far, "obstacle touched")

@@ -13,6 +13,7 @@ from napf_mpc.errors import DataError
 from napf_mpc.navigation.fix import diagonal
 from napf_mpc.problem import Problem
 from napf_mpc.safety_distance import Inflation
+from napf_mpc.world.moving import MovingObstacles, round_distance
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -195,10 +196,27 @@ class Contact:
     """Clearance there, below zero [m]."""
 
 
-def clearances(flown: Track, obstacles: ObstacleSet, radius_m: float) -> Array:
+def clearances(
+    flown: Track, obstacles: ObstacleSet, radius_m: float, moving: MovingObstacles | None = None
+) -> Array:
     """Clearance (time, uav) of each UAV's hull from the nearest obstacle (truth); +inf without any [m]."""
-    distance = obstacles.signed_distance(flown.position.reshape(1, -1, 3))
-    return distance.reshape(flown.position.shape[:2]) - radius_m
+    return _distances(flown.time_s, flown.position, obstacles, moving) - radius_m
+
+
+def _distances(
+    time_s: Array, position: Array, obstacles: ObstacleSet, moving: MovingObstacles | None
+) -> Array:
+    """Signed distance (time, uav) of points (time, uav, 3) to the nearest obstacle; +inf without any [m]."""
+    distance: Array = obstacles.signed_distance(position.reshape(1, -1, 3)).reshape(position.shape[:2])
+    if moving is None:
+        return distance
+    return np.asarray(np.minimum(distance, moving_distances(time_s, position, moving).min(-1)))
+
+
+def moving_distances(time_s: Array, position: Array, moving: MovingObstacles) -> Array:
+    """Signed distances (time, uav, n) of points (time, uav, 3) to the moving obstacles of a run then [m]."""
+    centres = np.stack([moving.position(time)[0] for time in time_s.tolist()])
+    return round_distance(position[:, :, None], centres[:, None], moving.radius, moving.upright)[0]
 
 
 def separations(flown: Track) -> Array:
@@ -215,9 +233,11 @@ SUBSTEPS = 8
 """Points looked at between two recorded samples, so that a graze between them is seen as well."""
 
 
-def contacts(flown: Track, obstacles: ObstacleSet, radius_m: float) -> list[Contact]:
+def contacts(
+    flown: Track, obstacles: ObstacleSet, radius_m: float, moving: MovingObstacles | None = None
+) -> list[Contact]:
     """Contacts of a flight, each at its deepest point, by UAV and time."""
-    if len(obstacles) == 0:
+    if len(obstacles) == 0 and moving is None:
         return []
     fine = np.linspace(0.0, len(flown.time_s) - 1.0, (len(flown.time_s) - 1) * SUBSTEPS + 1)
     low = np.minimum(fine.astype(int), max(0, len(flown.time_s) - 2))
@@ -225,7 +245,7 @@ def contacts(flown: Track, obstacles: ObstacleSet, radius_m: float) -> list[Cont
     high = np.minimum(low + 1, len(flown.time_s) - 1)
     time = flown.time_s[low] + share * (flown.time_s[high] - flown.time_s[low])
     position = flown.position[low] + share[:, None, None] * (flown.position[high] - flown.position[low])
-    clearance = obstacles.signed_distance(position.reshape(1, -1, 3)).reshape(position.shape[:2]) - radius_m
+    clearance = _distances(time, position, obstacles, moving) - radius_m
     found = []
     for uav in range(flown.uavs):
         inside = clearance[:, uav] < 0.0

@@ -71,7 +71,7 @@ class SweptClearance:
         ValueError
             If a shape does not fit or a position of an active run is not finite.
         """
-        start, stop, flying = _steps(p0, p1, active, self.clearance.shape)
+        start, stop, flying = check_steps(p0, p1, active, self.clearance.shape)
         _update(
             self.obstacles.solids,
             self.obstacles.tree,
@@ -133,15 +133,16 @@ def swept_separation(p0: ArrayLike, p1: ArrayLike, active: ArrayLike | None = No
     ValueError
         If a shape does not fit or a position of an active run is not finite.
     """
-    start, stop, flying = _steps(p0, p1, active, np.shape(p0)[:2])
+    start, stop, flying = check_steps(p0, p1, active, np.shape(p0)[:2])
     separation = np.full(start.shape[:2], np.inf)
     _separate(start, stop, flying, separation)
     return separation
 
 
-def _steps(
+def check_steps(
     p0: ArrayLike, p1: ArrayLike, active: ArrayLike | None, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Give positions at both ends of a step and the runs that fly, checked against a shape (run, uav)."""
     start = np.ascontiguousarray(p0, dtype=np.float64)
     stop = np.ascontiguousarray(p1, dtype=np.float64)
     for name, points in (("p0", start), ("p1", stop)):

@@ -394,10 +394,11 @@ def test_any_other_problem_gets_the_figures_of_a_run(tmp_path: Path, monkeypatch
     monkeypatch.setattr("napf_mpc.plot.paper.run_figures", lambda *given: called.append(given) or [])
     problem = load_problem("street_canyon", ["simulation.time_limit_s=1"])
     paper_figures(problem, "street_canyon", SEED, tmp_path)
-    ((given, name, trajectories, obstacles, planners, out),) = called
+    ((given, name, trajectories, obstacles, planners, out, moving),) = called
     assert (given, name, planners, out) == (problem, "street_canyon", ("apf", "napf"), tmp_path)
     assert set(trajectories["planner"]) == {"apf", "napf"}
     assert len(obstacles) > 0
+    assert moving is None
 
 
 def test_without_errors_the_estimate_is_the_truth(problem: Problem) -> None:
