@@ -103,25 +103,34 @@ class Plan:
 
         After the last stage the inputs are zero and the model runs on.
         """
-        age = max(0.0, time_s - self.made_s)
-        ends = np.cumsum(self.step_s)
-        # A node belongs to the stage that starts there; rounding of the clock must not look one stage back.
-        k = int(np.searchsorted(ends, age + 1e-9, side="right"))
-        base = self.initial if k == 0 else self.states[:, :, k - 1]
-        into = max(0.0, age - (float(ends[k - 1]) if k else 0.0))
-        held = self.inputs[:, :, k] if k < len(ends) else np.zeros((*base.shape[:2], INPUTS))
-        if into < 1e-9:
-            return base, held
-        a, b = _held(self.vehicle, self.yaw_rad, round(into, 9))
-        return np.einsum("ij,ruj->rui", a, base) + np.einsum("ij,ruj->rui", b, held), held
+        states, inputs = self._sampled(np.array([time_s]))
+        return states[:, :, 0], inputs[:, :, 0]
 
     def resampled(self, time_s: float, step_s: Array) -> tuple[Array, Array]:
         """States (run, uav, N, 12) and inputs (run, uav, N, 4) of these plans on a grid that starts later."""
         times = time_s + np.cumsum(step_s)
-        starts = times - step_s
-        states = np.stack([self.at(float(t))[0] for t in times], axis=2)
-        inputs = np.stack([self.at(float(t))[1] for t in starts], axis=2)
+        states, _ = self._sampled(times)
+        _, inputs = self._sampled(times - step_s)
         return states, inputs
+
+    def _sampled(self, times_s: Array) -> tuple[Array, Array]:
+        """States (run, uav, n, 12) and inputs (run, uav, n, 4) at times (n,)."""
+        age = np.maximum(0.0, times_s - self.made_s)
+        ends = np.cumsum(self.step_s)
+        # A node belongs to the stage that starts there; rounding of the clock must not look one stage back.
+        stage = np.searchsorted(ends, age + 1e-9, side="right")
+        into = np.maximum(0.0, age - np.append(0.0, ends)[stage])
+        nodes = np.concatenate([self.initial[:, :, None], self.states], axis=2)
+        idle = np.zeros((*self.initial.shape[:2], 1, INPUTS))
+        base = nodes[:, :, stage]
+        held = np.concatenate([self.inputs, idle], axis=2)[:, :, stage]
+        between = np.flatnonzero(into >= 1e-9)
+        if len(between):
+            maps = [_held(self.vehicle, self.yaw_rad, round(float(into[n]), 9)) for n in between]
+            a, b = np.stack([pair[0] for pair in maps]), np.stack([pair[1] for pair in maps])
+            moved = np.einsum("nij,runj->runi", a, base[:, :, between])
+            base[:, :, between] = moved + np.einsum("nij,runj->runi", b, held[:, :, between])
+        return base, held
 
     def resumed(self, time_s: float, step_s: Array) -> Plan:
         """The same plans from a later time on, on a grid that starts there."""
