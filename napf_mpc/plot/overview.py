@@ -174,5 +174,6 @@ def overview_figure(
         bar.ax.tick_params(length=2.0)
         bar.set_label("Height of roofs (m)")
     handles: list[Any] = [*uav_handles(flights[0].uavs), scene.start_mark(), scene.end_mark()]
+    handles += [scene.moving_mark()] * bool(problem.world.moving)
     page.legend(handles + [scene.contact_mark()] * found_any, height - 0.02)
     return page.figure
