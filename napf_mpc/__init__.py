@@ -11,13 +11,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from napf_mpc.block import Missions, simulate
     from napf_mpc.campaign import compare, run_campaign
+    from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
     from napf_mpc.errors import DataError, NapfError, OutputError, ProblemError, SceneError
     from napf_mpc.navigation.solution import NavSolution
+    from napf_mpc.planners.mpc import QpPlanner
     from napf_mpc.planners.planner import Command, Planner
     from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner
     from napf_mpc.problem import Problem
     from napf_mpc.problem_file import load_problem
     from napf_mpc.safety_distance import clearance_margin
+    from napf_mpc.solvers.solver import register_solver
     from napf_mpc.vehicle.lqr import lqr
     from napf_mpc.vehicle.quadrotor import linearize
 
@@ -26,7 +29,10 @@ __version__ = "0.1.0"
 _HOMES = {
     "ApfPlanner": "planners.potential_field",
     "Command": "planners.planner",
+    "Constraint": "constraints.constraint",
     "DataError": "errors",
+    "Horizon": "constraints.constraint",
+    "LinearRows": "constraints.constraint",
     "Missions": "block",
     "NapfError": "errors",
     "NapfPlanner": "planners.potential_field",
@@ -35,12 +41,14 @@ _HOMES = {
     "Planner": "planners.planner",
     "Problem": "problem",
     "ProblemError": "errors",
+    "QpPlanner": "planners.mpc",
     "SceneError": "errors",
     "clearance_margin": "safety_distance",
     "compare": "campaign",
     "linearize": "vehicle.quadrotor",
     "load_problem": "problem_file",
     "lqr": "vehicle.lqr",
+    "register_solver": "solvers.solver",
     "run_campaign": "campaign",
     "simulate": "block",
 }
@@ -48,7 +56,10 @@ _HOMES = {
 __all__ = [
     "ApfPlanner",
     "Command",
+    "Constraint",
     "DataError",
+    "Horizon",
+    "LinearRows",
     "Missions",
     "NapfError",
     "NapfPlanner",
@@ -57,12 +68,14 @@ __all__ = [
     "Planner",
     "Problem",
     "ProblemError",
+    "QpPlanner",
     "SceneError",
     "clearance_margin",
     "compare",
     "linearize",
     "load_problem",
     "lqr",
+    "register_solver",
     "run_campaign",
     "simulate",
 ]
