@@ -43,7 +43,9 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Print errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on standard output.")]
 Runs = Annotated[int, typer.Option(help="Number of runs.")]
 Workers = Annotated[int | None, typer.Option(help="Processes (default: one a core). Changes no result.")]
-Planner = Annotated[str | None, typer.Option(help="apf or napf (default: the problem's own).")]
+Planner = Annotated[
+    str | None, typer.Option(help="apf, napf, napf_guided, qp or qp_unguided (default: the problem's own).")
+]
 Animation = Annotated[bool, typer.Option("--animation", help="Draw an animation too: some ten seconds.")]
 
 
