@@ -142,9 +142,12 @@ def test_the_module_is_the_command() -> None:
         (f"compare P --seed {2**200}", "seed = an integer of more than 60 digits"),
         ("compare P --seed 2**200", "Invalid value for '--seed'"),
         (f"run P --seed {2**63}", f"seed = {2**63}"),
-        ("run P --planner pq", '"pq" is not a planner; choose from apf, napf, qp'),
+        ("run P --planner pq", '"pq" is not a planner; choose from apf, napf, napf_guided, qp, qp_unguided'),
         ("run P --planner nonsense", '"nonsense" is not a planner; choose from apf, napf'),
-        ("run P --planner nap", '"nap" is not a planner; choose from apf, napf, qp; did you mean napf?'),
+        (
+            "run P --planner nap",
+            '"nap" is not a planner; choose from apf, napf, napf_guided, qp, qp_unguided; did you mean napf?',
+        ),
         ("run P --planner=", '"" is not a planner'),
         ("montecarlo P --planner no --out O", '"no" is not a planner'),
         ("compare P --planners apf,no", '"no" is not a planner'),
@@ -319,7 +322,7 @@ def test_run_leaves_all_that_is_needed_to_judge_it_again(
     assert "brief, planner napf, run 3 of seed 0" in text
     assert f"results and figures: {out}" in text
     assert sorted(path.name for path in out.iterdir() if not path.name.startswith(".")) == [
-        "campaign.json", "runs.parquet", "scenario.json", "summary.json", "timing.parquet",
+        "campaign.json", "events.parquet", "runs.parquet", "scenario.json", "summary.json", "timing.parquet",
         "trajectories.parquet",
     ]  # fmt: skip
     summary = json.loads((out / "summary.json").read_text())
