@@ -170,11 +170,16 @@ class Guidance:
         # Where a UAV is already inside the margin, a way that gets no worse leads out.
         here = np.maximum(breach[..., 0], breach[..., 1])
         worse = breach - here[..., None]
-        distance = self._blocked_at(worse, settings.tolerance_m)
+        # With margins of ten metres an estimate wanders by more than what counts with margins of two.
+        margin = self._inflation.k * rms_sigma(self._covariance).max(-1)
+        scale = np.maximum(1.0, margin / settings.usual_margin_m)
+        distance = self._blocked_at(worse, settings.tolerance_m * scale)
         self._squeezing &= distance <= settings.stop_m + settings.slow_m
         self._squeezing |= self._held_s >= settings.squeeze_after_s
         distance = np.where(
-            self._squeezing, self._blocked_at(worse, max(settings.tolerance_m, settings.squeeze_m)), distance
+            self._squeezing,
+            self._blocked_at(worse, max(settings.tolerance_m, settings.squeeze_m) * scale),
+            distance,
         )
         release = np.where(self._holding, settings.release_m, 0.0)
         astray = np.abs(self._profiles[:, :, 0] - offset).max((-1, -2)) > settings.aside_m
@@ -194,9 +199,10 @@ class Guidance:
         slope = np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2).max((-1, -2))
         return np.asarray(np.clip(self.settings.flown_slope / np.maximum(slope, 1e-9), 0.3, 1.0))
 
-    def _blocked_at(self, breach: Array, tolerance_m: float) -> Array:
-        """Distance ahead (run,) at which the first UAV's breach (run, uav, station) exceeds a tolerance."""
-        return np.asarray(np.where(breach > tolerance_m, self.ahead_m, np.inf).min((-1, -2)))
+    def _blocked_at(self, breach: Array, tolerance_m: Array) -> Array:
+        """Distance ahead (run,) at which the first breach (run, uav, station) exceeds a tolerance (run,)."""
+        blocked = breach > tolerance_m[:, None, None]
+        return np.asarray(np.where(blocked, self.ahead_m, np.inf).min((-1, -2)))
 
     def _guide(self, along: Array, offset: Array) -> Guide:
         settings = self.settings
