@@ -171,7 +171,7 @@ def test_byte_order_mark_and_windows_line_ends_are_read(tmp_path: Path) -> None:
 WORLDS = '"empty", "list", "lanes", "scatter", "forest", "street_canyon" or "city"'
 SHAPES = '"sphere", "cylinder", "box" or "prism"'
 REFERENCE = "{ source = 'a', runs = 3, collision_risk = "
-PLANNERS = '"apf", "napf" or "qp"'
+PLANNERS = '"apf", "napf", "napf_guided", "qp" or "qp_unguided"'
 ERRORS = '"gauss_markov", "constant" or "recorded"'
 
 
