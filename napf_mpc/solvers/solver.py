@@ -73,14 +73,15 @@ MakeBackend = Callable[[Sparsity], Backend]
 
 _FACTORIES: dict[str, Callable[..., MakeBackend]] = {}
 _SHIPPED = {
-    "osqp": ("napf_mpc.solvers.osqp_", ""),
-    "cvxpy": ("napf_mpc.solvers.cvxpy_", "cvxpy"),
+    "osqp": ("napf_mpc.solvers.osqp_", "osqp"),
+    "cvxpy": ("napf_mpc.solvers.cvxpy_", "napf-mpc[cvxpy]"),
     **dict.fromkeys(
-        ("piqp", "daqp", "clarabel", "proxqp", "highs", "quadprog"),
-        ("napf_mpc.solvers.qpsolvers_", "solvers"),
+        ("piqp", "daqp", "clarabel", "highs"), ("napf_mpc.solvers.qpsolvers_", "napf-mpc[solvers]")
     ),
+    "proxqp": ("napf_mpc.solvers.qpsolvers_", "qpsolvers[proxqp]"),
+    "quadprog": ("napf_mpc.solvers.qpsolvers_", "qpsolvers[quadprog]"),
 }
-"""Name -> module, imported on use, and the extra to install for it."""
+"""Name -> module, imported on use, and what to install for it."""
 
 
 def register_solver(name: str, factory: Callable[..., MakeBackend]) -> None:
@@ -119,11 +120,11 @@ def backend_maker(name: str, **settings: object) -> MakeBackend:
     """
     if name not in solver_names():
         raise SolverError(f"solver {name!r} is not known; choose from {', '.join(solver_names())}")
-    module, extra = _SHIPPED.get(name, ("", ""))
+    module, package = _SHIPPED.get(name, ("", ""))
     try:
         maker = _FACTORIES[name](**settings) if not module else import_module(module).maker(name, **settings)
     except ImportError as error:
-        hint = f"; install it with: pip install 'napf-mpc[{extra}]'" if extra else ""
+        hint = f"; install it with: pip install '{package}'" if package else ""
         raise SolverError(f"solver {name!r} needs a package that is not installed ({error}){hint}") from error
     except TypeError as error:
         raise SolverError(f"solver {name!r}: {error}") from error
