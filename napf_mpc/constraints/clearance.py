@@ -218,8 +218,8 @@ class ObstacleInfluence(_Shell):
     F / |F'|``, so that minus the gradient of w2 s^2 / 2 by the position is c times NAPF's force along n: its
     magnitude (Eq. 28), its direction (Eq. 29) and, over the rows, its sum (Eq. 36). A weight of F over the
     whole distance left to rho_0 has the same force but too small a slope, by 3 rho_0 / rho_bar - 2: the plan
-    then leaps between contact and rho_0 from step to step. Beyond rho_0, where NAPF does nothing, the target is rho_0 and the
-    weight the slope there: it counts only once a plan comes nearer.
+    then leaps between contact and rho_0 from step to step. Beyond rho_0, where NAPF does nothing, the target
+    is rho_0 and the weight the slope there: it counts only once a plan comes nearer.
     """
 
     per_speed: float = 1.0

@@ -366,7 +366,8 @@ def test_unknown_names_missing_extras_and_settings() -> None:
     with pytest.raises(SolverError, match="setting 'rhoo' is not known"):
         make_solver("osqp", rhoo=1.0)
     for name in set(solver_names()) - set(SOLVERS):
-        with pytest.raises(SolverError, match=r"pip install 'napf-mpc\[solvers\]'"):
+        package = rf"qpsolvers\[{name}\]" if name in ("proxqp", "quadprog") else r"napf-mpc\[solvers\]"
+        with pytest.raises(SolverError, match=f"pip install '{package}'"):
             make_solver(name)
     with pytest.raises(SolverError, match="exists already"):
         register_solver("osqp", lambda: lambda sparsity: None)  # type: ignore[arg-type, return-value]
