@@ -172,7 +172,7 @@ class Guidance:
         worse = breach - here[..., None]
         # With margins of ten metres an estimate wanders by more than what counts with margins of two.
         margin = self._inflation.k * rms_sigma(self._covariance).max(-1)
-        scale = np.maximum(1.0, margin / settings.usual_margin_m)
+        scale = np.maximum(1.0, margin / settings.usual_margin_m) ** 1.5
         distance = self._blocked_at(worse, settings.tolerance_m * scale)
         self._squeezing &= distance <= settings.stop_m + settings.slow_m
         self._squeezing |= self._held_s >= settings.squeeze_after_s

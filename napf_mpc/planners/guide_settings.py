@@ -73,8 +73,8 @@ class GuidanceSettings:
     """Distance over which steeper pieces are slowed down for [m]."""
     tolerance_m: float = 0.25
     """Breach from which a way counts as blocked [m]."""
-    usual_margin_m: float = 1.5
-    """Tolerance and squeeze are for margins k sigma up to this, and grow in proportion beyond [m]."""
+    usual_margin_m: float = 2.5
+    """Tolerance and squeeze are for margins k sigma up to this; beyond, they grow with its power 1.5 [m]."""
     stop_m: float = 5.0
     """Distance to a blocked place at which the formation holds [m]."""
     slow_m: float = 10.0
