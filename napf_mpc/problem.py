@@ -663,7 +663,7 @@ class Planner(_Section):
     """QP planner: times that a step's programs are made linear at the last answer and solved."""
     obstacle_rows: int = Field(4, ge=1, le=50)
     """QP planner: nearest obstacles that each stage of each UAV keeps rows for, in each of two shells."""
-    position_weight: float = Field(1.0, ge=1e-6, le=1e6)
+    position_weight: float = Field(4.0, ge=1e-6, le=1e6)
     """QP planner: weight of the distance to the slot [1/(m^2 s)]."""
     velocity_weight: float = Field(1.0, ge=0.0, le=1e6)
     """QP planner: weight of the velocity error [s/m^2]."""

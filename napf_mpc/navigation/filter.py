@@ -286,4 +286,5 @@ class KalmanFilter:
             body_rates=body_rates,
             covariance=covariance,
             common_factor=self._common_factor,
+            filtered=True,
         )

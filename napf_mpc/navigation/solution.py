@@ -37,6 +37,8 @@ class NavSolution:
     """(run, uav, 3, rank) factor L of the part that UAVs share: Sigma_ij = L_i L_j^T [m]."""
     airborne: NDArray[np.bool_] | None = None
     """(run, uav): whether the UAV still flies its mission, so a planner has to work for it; None for all."""
+    filtered: bool = False
+    """Whether it is a filter's estimate, whose error does not depend on it, or a measurement."""
     tracks: Tracks | None = None
     """Moving obstacles as tracked now; None in a world without any."""
 

@@ -36,7 +36,7 @@ from napf_mpc.world.distance import Solids
 
 Array = NDArray[np.float64]
 
-PUSH = 500.0
+PUSH = 2500.0
 """Price of a squared shortfall in the band [1/m^2]: what is left of it is a few centimetres."""
 TIGHT_M = 10.0
 """A profile starts where the UAV is if something is in the way over this distance."""

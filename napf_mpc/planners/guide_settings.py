@@ -33,23 +33,23 @@ class GuidanceSettings:
     """Layers to pass spheres, half of them up and half down."""
     wide_m: float = 6.0
     """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
-    path: float = 1.5
+    path: float = 3.0
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
-    shape: float = 2.5
+    shape: float = 8.0
     """Price of a squared difference to the mean of all offsets [1/m^2 per metre]."""
-    far_m: float = 8.0
+    far_m: float = 5.0
     """Offsets beyond this are priced linearly [m]."""
-    slope: float = 16.0
+    slope: float = 6.0
     """Price of a squared slope [per metre]."""
     steep: float = 0.7
     """Slope from which that price rises with the slope's fourth power."""
-    bend: float = 30.0
+    bend: float = 10.0
     """Price of a squared change of slope per metre [m^2 per metre]."""
     keep: float = 1.0
     """Price of a squared difference to the last profile [1/m^2 per metre]."""
     keep_m: float = 4.0
     """Differences beyond this cost no more: another side may be taken if it is clearly cheaper [m]."""
-    spare_m: float = 0.3
+    spare_m: float = 0.2
     """Distance kept beyond radius and k sigma, where there is room [m]."""
     spare: float = 200.0
     """Price of a squared lack of spare [1/m^2 per metre]."""
@@ -71,13 +71,13 @@ class GuidanceSettings:
     """Slope that is flown at full pace."""
     bend_m: float = 6.0
     """Distance over which steeper pieces are slowed down for [m]."""
-    tolerance_m: float = 0.25
+    tolerance_m: float = 0.35
     """Breach from which a way counts as blocked [m]."""
     usual_margin_m: float = 2.5
     """Tolerance and squeeze are for margins k sigma up to this; beyond, they grow with its power 1.5 [m]."""
-    stop_m: float = 5.0
+    stop_m: float = 4.0
     """Distance to a blocked place at which the formation holds [m]."""
-    slow_m: float = 10.0
+    slow_m: float = 5.0
     """It slows over this distance before [m]."""
     release_m: float = 2.0
     """A hold ends when the blocked place is this much farther away [m]."""
@@ -87,7 +87,7 @@ class GuidanceSettings:
     """A hold of this length lets UAVs look for a way aside on the spot [s]."""
     squeeze_m: float = 0.8
     """Breach that is accepted after a hold, and announced; 0 for never [m]."""
-    squeeze_after_s: float = 8.0
+    squeeze_after_s: float = 4.0
     """Length of that hold [s]."""
     aside_m: float = 1.5
     """A UAV this far off its guide is waited for while the others hold [m]."""

@@ -358,6 +358,8 @@ def _reasons(action: Codes, trusted: Mask) -> Codes:
 
 
 def _sigma(nav: NavSolution, trusted: Mask) -> Array:
+    if nav.filtered:
+        return np.zeros(trusted.shape)
     return rms_sigma(np.where(trusted[..., None, None], nav.position_covariance, 0.0))
 
 
