@@ -36,7 +36,7 @@ from napf_mpc.plot import (
     run_figures,
     scene,
 )
-from napf_mpc.plot.compare import clearance_figure, ecdf, published, risk_figure, trade_figure
+from napf_mpc.plot.compare import clearance_figure, ecdf, published, risk_figure
 from napf_mpc.plot.field import limit_cases, potential_at, surface_figure, walk_figure
 from napf_mpc.plot.flight import MOST_INFLATED, paths_figure, spread, uncertainty_figure
 from napf_mpc.plot.overview import overview_figure
@@ -45,6 +45,7 @@ from napf_mpc.plot.space import space_figure
 from napf_mpc.plot.states import angle_figure, attitude_figure, axis_figure, distance_figure, motion_figure
 from napf_mpc.plot.style import FONT_PT, credit_of, house_style, uav_colour
 from napf_mpc.plot.tracks import SUBSTEPS, Track, acting, clearances, contacts, encounters, separations, track
+from napf_mpc.plot.trade import draw_fronts, fronts_figure, trade_figure
 from napf_mpc.problem import City, Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.provenance import identity
