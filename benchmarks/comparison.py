@@ -171,7 +171,9 @@ def line(flown: Flown) -> str:
 def reasons(result: dict[str, Any]) -> str:
     """Why runs did not finish, with counts: the planner's own words, or no more than that time was up."""
     words = [f"{count} {word}" for word, count in result["reasons"].items()]
-    silent = result["runs"] - round(result["finished"] * result["runs"]) - sum(result["reasons"].values())
+    told = round(result["finished"] * result["runs"]) + sum(result["reasons"].values())
+    # A run that failed has no numbers, and may not have a reason either: it is counted in its own column.
+    silent = max(0, result["runs"] - told - result["failed"])
     return ", ".join([*words, *([f"{silent} on the way when time was up"] if silent else [])]) or "-"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,8 @@ FINISHED = 0.95
 """A planner of which fewer missions finish is drawn hollow: it may be safe because it stands still."""
 LEFT_IN, GAP_IN, RIGHT_IN = 0.55, 0.25, 0.1
 """Margins of the two panels on a page [in]."""
+NOTE_CHARACTERS = 112
+"""In a line of the note above the panels."""
 
 Part = Mapping[str, Any]
 """What a summary says of one planner."""
@@ -41,7 +44,7 @@ def trade_figure(summary: Mapping[str, Any], credit: str = "") -> Figure:
         Source and licence of shared data, printed below.
     """
     planners: Mapping[str, Part] = summary["planners"]
-    bottom, tall, top = 0.4, 2.0, 0.6
+    bottom, tall, top = 0.4, 2.0, 0.56
     page = Page.of_size(PAGE_IN, bottom + tall + top, credit)
     for place, axes in enumerate(_panels(page, bottom, tall)):
         metric, words = METRICS[place]
@@ -79,9 +82,9 @@ def fronts_figure(
     if not levels:
         raise ValueError("fronts is empty: there is nothing to draw")
     markers = {k: K_MARKERS[i % len(K_MARKERS)] for i, k in enumerate(levels)}
-    tall, title, between, bottom, top = 1.45, 0.2, 0.3, 0.42, 0.62
+    tall, title, between, bottom, top = 1.45, 0.2, 0.3, 0.42, 0.5
     row = tall + title + between
-    height = bottom - between + row * len(fronts) + top
+    height = bottom + row * len(fronts) - between + top
     page = Page.of_size(PAGE_IN, height, " ".join(words for words in (note, credit) if words))
     for place, (cell, of_planner) in enumerate(fronts.items()):
         base = bottom + row * (len(fronts) - 1 - place)
@@ -102,7 +105,7 @@ def fronts_figure(
                 for k, part in known:
                     _point(axes, part, metric, colour, markers[k], thin=True)
             _scale(axes, parts, metric)
-            _floor(axes, parts, metric, named=place == 0)
+            _floor(axes, parts, metric)
             if place == len(fronts) - 1:
                 axes.set_xlabel(words)
             if side == 0:
@@ -161,25 +164,16 @@ def _scale(axes: Axes, parts: Iterable[Part], metric: str) -> None:
     floors = [part["shape_floor_m"]["median"] or 0.0 for part in known] if metric == "shape_rms_m" else []
     reach = max([*ends, *floors], default=0.0)
     highest = round_up(max((part["collision_risk_high"] for part in known), default=1.0))
-    axes.set(xlim=(0.0, 1.06 * reach or 1.0), ylim=(0.0, highest))
+    # A little below zero, so that points and bars of planners that never hit do not lie on the axis.
+    axes.set(xlim=(0.0, 1.06 * reach or 1.0), ylim=(-0.04 * highest, highest))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
 
 
-def _floor(axes: Axes, parts: Iterable[Part], metric: str, named: bool = True) -> None:
+def _floor(axes: Axes, parts: Iterable[Part], metric: str) -> None:
     """Mark what the navigation errors alone do to the shape."""
-    floors = [part["shape_floor_m"]["median"] for part in parts]
-    known = [floor for floor in floors if floor is not None]
-    if metric != "shape_rms_m" or not known:
-        return
-    floor = float(np.median(known))
-    axes.axvline(floor, color=GREY, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1)
-    if named:
-        left = floor < 0.5 * axes.get_xlim()[1]
-        axes.annotate(
-            "navigation errors alone", (floor, 1.0), xycoords=("data", "axes fraction"),
-            xytext=(3 if left else -3, 1), textcoords="offset points",
-            ha="left" if left else "right", va="bottom", color=GREY,
-        )  # fmt: skip
+    known = [part["shape_floor_m"]["median"] for part in parts if part["shape_floor_m"]["median"] is not None]
+    if metric == "shape_rms_m" and known:
+        axes.axvline(float(np.median(known)), color=GREY, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1)
 
 
 def _point(
@@ -221,7 +215,11 @@ def _planner_handle(name: str, marker: str = "") -> Line2D:
 def _key(page: Page, edge_in: float, handles: list[Any], parts: Iterable[Part]) -> None:
     """Legend, and below it what bars and hollow points mean."""
     page.legend(handles, edge_in, x=LEFT_IN)
-    words = "bars: 5th to 95th percentile of runs; 95 % interval of the risk"
-    if not all(_finishes(part) for part in parts):
-        words += f"; hollow: fewer than {100 * FINISHED:g} % finished"
-    page.text(LEFT_IN, edge_in - 0.17, words, ha="left", va="top", color=GREY)
+    every = list(parts)
+    words = ["bars: 5th to 95th percentile of runs, and 95 % interval of the risk"]
+    if any(part["shape_floor_m"]["median"] is not None for part in every):
+        words.append("dashed: shape error from navigation errors alone")
+    if not all(_finishes(part) for part in every):
+        words.append(f"hollow: fewer than {100 * FINISHED:g} % of the missions finished")
+    note = "\n".join(textwrap.wrap("; ".join(words), NOTE_CHARACTERS))
+    page.text(LEFT_IN, edge_in - 0.17, note, ha="left", va="top", color=GREY, linespacing=1.15)
