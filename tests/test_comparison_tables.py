@@ -147,8 +147,6 @@ def test_what_is_not_round_is_refused(orca: Any) -> None:
 
 
 def test_a_formation_that_orca_leaves_alone_flies_its_lanes(orca: Any) -> None:
-    from napf_mpc.campaign import simulate
-
     problem = load_problem(
         "study_8c", {"world.count": 0, "navigation.error_scale": 0.0, "mission.length_m": 40}
     )
