@@ -689,6 +689,8 @@ class Planner(_Section):
     """With ``risk_per_mission``: time for which each UAV has an obstacle at its margin, in all."""
     risk_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
     """With ``risk_per_mission``: correlation time of the position's error; by default navigation's own."""
+    covariance: Literal["held", "expected", "propagated"] = "held"
+    """QP planner: over the horizon, the covariance reported now; what the filter expects if fixes go on as now; or if none comes any more. Never less than now."""  # noqa: E501
     inflation: Literal["shift", "range"] = "shift"
     """k sigma shifts the distance to the obstacle, or only widens the range of influence."""
     sigma: Literal["directional", "largest", "rms", "chi2"] = "directional"

@@ -235,7 +235,7 @@ def test_planners_see_observations_not_places() -> None:
         assert np.abs(error).max() < 5.0 * claimed < 25.0 * sigma
 
 
-@pytest.mark.parametrize("planner", ["apf", "napf"])
+@pytest.mark.parametrize("planner", ["apf", "napf", "napf_guided"])
 def test_runs_do_not_depend_on_their_block(planner: str) -> None:
     problem = load_problem("crossing_traffic", ["mission.length_m=30"])
     whole = fly_block(problem, [planner], 4, range(6)).rows
@@ -304,7 +304,7 @@ def test_napf_inflates_by_the_uncertainty_of_the_track_too() -> None:
     assert aside["napf", 1.5] < -0.1
 
 
-@pytest.mark.parametrize("planner", ["apf", "qp"])
+@pytest.mark.parametrize("planner", ["apf", "napf_guided", "qp"])
 def test_a_slow_crossing_ball_is_avoided(planner: str) -> None:
     """It would hit the UAV in the middle; avoided, there is air between, and the mission is flown."""
     slow = BALL | {"start_m": [12.0, 3.2, 0.0], "velocity_mps": [0.0, -0.5, 0.0]}

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation import cross_covariance, kalman
+from napf_mpc.navigation.forecast import CovarianceForecast, ForecastModel, drifts
 from napf_mpc.navigation.sensors import bias_memory
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Recorded
@@ -111,6 +112,25 @@ class FilterModel:
             coast_sigma_m=navigation.filter_coast_sigma_m,
         )
 
+    def forecast(self) -> ForecastModel:
+        """Return the part that tells how the covariance goes on."""
+        return ForecastModel(
+            period_s=self.period_s,
+            ticks_per_epoch=self.ticks_per_epoch,
+            drift=drifts(
+                self.period_s,
+                self.bias_memory,
+                self.velocity_change_noise,
+                self.bias_noise,
+                self.ticks_per_epoch,
+            ),
+            error_memory=self.error_memory,
+            error_noise=self.error_noise,
+            fixless_axis=self.fixless_axis,
+            position_noise=RECEIVER_NOISE_M**2,
+            velocity_noise=self.velocity_sigma_mps**2,
+        )
+
 
 class KalmanFilter:
     """The filters of all UAVs of a block of runs.
@@ -136,6 +156,9 @@ class KalmanFilter:
         self._refused_s = np.zeros((runs, uavs))
         self._refused_fixes = np.zeros((runs, uavs), dtype=np.int64)
         self._verdict = np.zeros((runs, uavs), dtype=np.int8)
+        self._forecast = model.forecast()
+        self._sigma = np.full((runs, uavs, 3), np.nan)
+        self._epochs_since_new, self._epochs_per_new = 0, 1
 
         shared = bool(model.common_share.any()) and 1 < uavs <= cross_covariance.MAX_UAVS
         kept = runs if shared or model.coupled else 0
@@ -225,6 +248,10 @@ class KalmanFilter:
             self._response,
         )
         self._age = 0
+        self._sigma = sigma
+        self._epochs_since_new += 1
+        if new:
+            self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
         self._note_verdict(available, active)
         self._advance_covariances(covariance, sigma, active)
 
@@ -287,4 +314,13 @@ class KalmanFilter:
             covariance=covariance,
             common_factor=self._common_factor,
             filtered=True,
+            forecast=CovarianceForecast(
+                self._forecast,
+                self._packed.copy(),
+                self._sigma,
+                self._used,
+                self._age,
+                max(1, self._epochs_per_new - self._epochs_since_new),
+                self._epochs_per_new,
+            ),
         )

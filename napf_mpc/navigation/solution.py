@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.navigation.forecast import CovarianceForecast
 from napf_mpc.navigation.tracks import Tracks
 
 Array = NDArray[np.float64]
@@ -41,6 +42,8 @@ class NavSolution:
     """Whether it is a filter's estimate, whose error does not depend on it, or a measurement."""
     tracks: Tracks | None = None
     """Moving obstacles as tracked now; None in a world without any."""
+    forecast: CovarianceForecast | None = None
+    """What the filter knows of its covariance to come; None if the law of the errors is not known."""
 
     @property
     def position_covariance(self) -> Array:
@@ -58,6 +61,29 @@ class NavSolution:
         cross = np.einsum("rak,rbk->rab", self.common_factor[:, i], self.common_factor[:, j])
         sigma = self.position_covariance
         return np.asarray(sigma[:, i] + sigma[:, j] - cross - cross.transpose(0, 2, 1))
+
+    def position_covariance_ahead(self, ahead_s: Array, with_fixes: bool) -> Array:
+        """Covariance of the position at times from now: that of now, grown as the filter expects.
+
+        Never less than now in any direction: the growth of each axis counts where it is positive. Covariance
+        between axes is held. Without a forecast all is.
+
+        Parameters
+        ----------
+        ahead_s : array, shape (N,)
+            Times from now, >= 0 and increasing [s].
+        with_fixes : bool
+            Whether fixes go on as they come now, or none does.
+
+        Returns
+        -------
+        array, shape (run, uav, N, 3, 3)
+            [m^2].
+        """
+        out = np.repeat(self.position_covariance[:, :, None], len(ahead_s), axis=2)
+        if self.forecast is not None:
+            np.einsum("...ii->...i", out)[...] += self.forecast.growth(ahead_s, with_fixes)
+        return out
 
     def trusted(self) -> NDArray[np.bool_]:
         """(run, uav): a fix is there, all numbers are finite, and the covariance of the position is one.

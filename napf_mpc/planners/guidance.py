@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets, synchronisation_error
+from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import SolidBoxes, frame_of, solid_boxes
 from napf_mpc.planners.guide_search import plan_all, resample_all
 from napf_mpc.planners.guide_settings import FINE, GuidanceSettings, search_of
+from napf_mpc.planners.guide_traffic import TrafficPace, slowed
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.safety_distance import Inflation, largest_sigma, rms_sigma
 from napf_mpc.world.obstacles import ObstacleSet
@@ -49,6 +51,9 @@ class Guidance:
         self._slots = formation_offsets(problem.formation)
         self._lanes = np.ascontiguousarray(self._slots[:, 1:])
         self._min_separation = problem.vehicle.min_separation_m
+        self._traffic = TrafficPace(
+            self._path, problem.mission.speed_mps, problem.vehicle.radius_m, inflation
+        )
         self._search = search_of(self.settings, inflation.k, problem.vehicle.radius_m)
         stations = (self._search.lattice.stations - 1) * FINE + 1
         self._step_m = self._search.lattice.step_m / FINE
@@ -79,8 +84,16 @@ class Guidance:
         self._squeezing = np.zeros(runs, dtype=bool)
         self._given_up = np.zeros(runs, dtype=bool)
         self._pace = np.ones(runs)
+        self._traffic_pace = np.ones(runs)
 
-    def step(self, position: Array, covariance: Array, trusted: NDArray[np.bool_], time_s: float) -> Guide:
+    def step(
+        self,
+        position: Array,
+        covariance: Array,
+        trusted: NDArray[np.bool_],
+        time_s: float,
+        tracks: Tracks | None = None,
+    ) -> Guide:
         """Guide from what navigation reports; plans anew when its period has passed.
 
         Parameters
@@ -93,6 +106,8 @@ class Guidance:
             Where the estimate may be used; elsewhere the last trusted one is.
         time_s : float
             Time since the start [s].
+        tracks : Tracks, optional
+            Moving obstacles to slow down for.
 
         Returns
         -------
@@ -103,12 +118,20 @@ class Guidance:
         self._covariance = np.where(trusted[..., None, None], covariance, self._covariance)
         place = self._path.to_path(self._position)
         along = np.ascontiguousarray(place[..., 0])
-        if time_s >= self._next_s - 1e-9:
+        due = time_s >= self._next_s - 1e-9
+        if due:
             elapsed = 0.0 if np.isnan(self._last_s) else time_s - self._last_s
             self._plan(place, elapsed)
             self._last_s = time_s
             self._next_s = time_s + self.settings.period_s
-        return self._guide(along, self._from(along))
+        guide = self._guide(along, self._from(along))
+        if tracks is None or not tracks.count:
+            return guide
+        if due:
+            self._traffic_pace = self._traffic.pace(
+                self._position, self._covariance, guide, tracks, self._traffic_pace
+            )
+        return slowed(guide, self._traffic_pace)
 
     def _from(self, along: Array) -> Array:
         """Profiles (run, uav, station, 2) as seen from along-track places (run, uav)."""

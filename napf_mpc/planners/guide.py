@@ -19,7 +19,7 @@ class Passage(IntEnum):
     DETOUR = 1
     """Its way bends around something."""
     WAIT = 2
-    """It slows for a UAV that was left behind."""
+    """It slows for a UAV that was left behind, or for what will cross its way."""
     SQUEEZE = 3
     """After a hold it goes through with less than the margin; ``breach_m`` says how much less."""
     HOLD = 4

@@ -33,6 +33,8 @@ MOST_PULL_MPS = 1.0
 class GuidedNapfPlanner(PotentialFieldPlanner):
     """NAPF that follows formation guidance: lane plus offset, and the guide's tangent as direction.
 
+    Moving obstacles repel as in NAPF, and guidance slows where they will cross the way.
+
     Away from obstacles it flies exactly like :class:`~napf_mpc.planners.potential_field.NapfPlanner`.
 
     Parameters
@@ -58,7 +60,7 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
         position, covariance, trusted = self._estimates(nav)
-        guide = self.guidance.step(position, covariance, trusted, time_s)
+        guide = self.guidance.step(position, covariance, trusted, time_s, nav.tracks)
         self.guide = guide
         place = self._frame.to_path(position)
         error = synchronisation_error(place[..., 0], self._offsets[:, 0])
@@ -70,6 +72,9 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
             settings.max_speed_ratio * mission.speed_mps,
         )
         force, avoiding = self._repulsion(position, covariance)
+        if nav.tracks is not None and nav.tracks.count:
+            away, near = self._moving_repulsion(position, covariance, nav.tracks)
+            force, avoiding = force + away, avoiding | near
         lane = self._offsets[:, 1:] + guide.at(0.0)
         off = lane - place[..., 1:]
         slope = guide.slope(0.0, TANGENT_M)

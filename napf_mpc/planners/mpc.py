@@ -231,19 +231,25 @@ class QpPlanner:
 
     def _horizon(self, guess: Array, nav: NavSolution, trusted: Mask, time_s: float) -> Horizon:
         known = trusted[..., None, None]
-        covariance = np.where(known, nav.position_covariance, np.eye(3))
         return Horizon(
             time_s=time_s,
             step_s=self._model.step_s,
             position=guess[..., POSITION],
             velocity=guess[..., VELOCITY],
-            covariance=np.repeat(covariance[:, :, None], self._model.stages, axis=2),
+            covariance=np.where(known[..., None], self._covariance(nav), np.eye(3)),
             common_factor=np.where(known, nav.common_factor, 0.0),
             obstacles=self._obstacles,
             frame=self._frame,
             problem=self.problem,
             tracks=nav.tracks,
         )
+
+    def _covariance(self, nav: NavSolution) -> Array:
+        """Covariance of the position (run, uav, N, 3, 3) at the end of each stage, as the problem asks."""
+        asked = self.problem.planner.covariance
+        if asked == "held":
+            return np.repeat(nav.position_covariance[:, :, None], self._model.stages, axis=2)
+        return nav.position_covariance_ahead(self._model.times_s, with_fixes=asked == "expected")
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""

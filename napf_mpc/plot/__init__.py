@@ -8,11 +8,13 @@ from napf_mpc.plot.compare import compare_figures
 from napf_mpc.plot.flight import run_figures
 from napf_mpc.plot.overview import Mission, paths_overview, pick_missions
 from napf_mpc.plot.paper import paper_figures
+from napf_mpc.plot.trade import draw_fronts
 
 __all__ = [
     "Mission",
     "animation",
     "compare_figures",
+    "draw_fronts",
     "paper_figures",
     "paths_overview",
     "pick_missions",

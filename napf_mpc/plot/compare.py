@@ -15,19 +15,15 @@ from numpy.typing import NDArray
 from napf_mpc.plot.style import (
     BLACK,
     COLUMN_IN,
-    GREY,
-    PAGE_IN,
     Page,
     house_style,
     planner_colour,
     planner_name,
     save,
 )
+from napf_mpc.plot.trade import round_up, trade_figure
 from napf_mpc.problem import Reference
 from napf_mpc.risk import Rate, wilson
-
-TRADES = (("shape_rms_m", "Shape RMS (m)"), ("path_rms_m", "Path RMS (m)"))
-"""Metrics that are set against the risk."""
 
 
 def compare_figures(
@@ -111,7 +107,7 @@ def risk_figure(summary: Mapping[str, Any], reference: Reference | None = None, 
             zorder=3,
         )
     axes.set_yticks(range(len(lines)), [line[1] for line in reversed(lines)])
-    axes.set(ylim=(-0.6, len(lines) - 0.4), xlim=(0.0, _round_up(max(line[4] for line in lines))))
+    axes.set(ylim=(-0.6, len(lines) - 0.4), xlim=(0.0, round_up(max(line[4] for line in lines))))
     axes.set_xlabel("Collision risk (%), 95 % interval")
     axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
     axes.tick_params(axis="y", length=0.0, pad=7.0)
@@ -119,77 +115,6 @@ def risk_figure(summary: Mapping[str, Any], reference: Reference | None = None, 
     axes.grid(axis="x", color="#E4E4E4", linewidth=0.5)
     axes.set_axisbelow(True)
     return page.figure
-
-
-def _round_up(share: float) -> float:
-    for limit in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0):
-        if share <= limit:
-            return limit
-    return 1.0
-
-
-def trade_figure(summary: Mapping[str, Any], credit: str = "") -> Figure:
-    """Collision risk with its 95 % interval against formation error, median and 5th to 95th percentile.
-
-    A dashed line marks ``shape_floor_m``: the shape error that the navigation errors alone would cause if
-    every UAV sat on its estimate's slot. A UAV too slow to follow its estimate can stay below.
-    """
-    planners: Mapping[str, Any] = summary["planners"]
-    left, gap, bottom, tall, top = 0.5, 0.25, 0.4, 2.0, 0.44
-    wide = (PAGE_IN - left - gap - 0.1) / 2
-    page = Page.of_size(PAGE_IN, bottom + tall + top, credit)
-    highest = _round_up(max(part["collision_risk_high"] for part in planners.values()))
-    for place, (metric, words) in enumerate(TRADES):
-        axes = page.axes(left + place * (wide + gap), bottom, wide, tall)
-        reach = 0.0
-        for name, part in planners.items():
-            spread = part[metric]
-            if spread["median"] is None:
-                continue
-            axes.errorbar(
-                spread["median"],
-                part["collision_risk"],
-                xerr=[[spread["median"] - spread["p05"]], [spread["p95"] - spread["median"]]],
-                yerr=[
-                    [max(0.0, part["collision_risk"] - part["collision_risk_low"])],
-                    [max(0.0, part["collision_risk_high"] - part["collision_risk"])],
-                ],
-                fmt="o",
-                markersize=5,
-                capsize=2.5,
-                elinewidth=1.0,
-                color=planner_colour(name),
-                zorder=3,
-                clip_on=False,
-            )
-            reach = max(reach, spread["p95"])
-        floors = [part["shape_floor_m"]["median"] for part in planners.values()]
-        known = [floor for floor in floors if floor is not None]
-        if metric == "shape_rms_m" and known:
-            floor = float(np.median(known))
-            axes.axvline(floor, color=GREY, linewidth=0.8, linestyle=(0, (4, 2)), zorder=1)
-            axes.annotate(
-                "navigation errors alone", (floor, 1.0), xycoords=("data", "axes fraction"),
-                xytext=(0, 2), textcoords="offset points", ha="center", va="bottom", color=GREY,
-            )  # fmt: skip
-            reach = max(reach, floor)
-        axes.set(xlim=(0.0, 1.06 * reach or 1.0), ylim=(0.0, highest), xlabel=words)
-        axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
-        axes.tick_params(labelleft=place == 0)
-        if place == 0:
-            axes.set_ylabel("Collision risk (%)")
-    edge = bottom + tall + top - 0.02
-    page.legend(_planner_handles(planners), edge, x=left)
-    note = "bars: 5th to 95th percentile of runs; 95 % interval of the risk"
-    page.text(PAGE_IN - 0.1, edge, note, ha="right", va="top", color=GREY)
-    return page.figure
-
-
-def _planner_handles(planners: Mapping[str, Any]) -> list[Line2D]:
-    return [
-        Line2D([], [], color=planner_colour(name), marker="o", markersize=4.5, label=planner_name(name))
-        for name in planners
-    ]
 
 
 def clearance_figure(

@@ -33,8 +33,20 @@ BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 UAV_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 """Colour of UAV 1, 2, ...; repeated for larger formations."""
-PLANNER_COLOURS = {"apf": VERMILION, "napf": BLUE, "napf_guided": SKY, "qp": GREEN}
-PLANNER_NAMES = {"apf": "APF", "napf": "NAPF", "napf_guided": "NAPF guided", "qp": "QP"}
+PLANNER_COLOURS = {
+    "apf": VERMILION,
+    "napf": BLUE,
+    "napf_guided": SKY,
+    "qp": GREEN,
+    "qp_unguided": PURPLE,
+}
+PLANNER_NAMES = {
+    "apf": "APF",
+    "napf": "NAPF",
+    "napf_guided": "NAPF guided",
+    "qp": "QP",
+    "qp_unguided": "QP unguided",
+}
 GREY, PALE, RULE = "#6E6E6E", "#C8C8C8", "#3C3C3C"
 """Notes, fills and thin rules."""
 

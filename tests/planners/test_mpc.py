@@ -189,6 +189,49 @@ def test_a_constraint_of_ones_own_is_kept() -> None:
     np.testing.assert_allclose(command.plan.states[..., -1, 4], -2.0, atol=0.02)
 
 
+@pytest.mark.parametrize("asked", ["held", "expected", "propagated"])
+def test_the_margin_of_a_stage_is_that_of_the_covariance_then(asked: str) -> None:
+    """A flight of 5 s through the filter: 3 sigma 6.5 s ahead grow by 0.3 m if fixes cease."""
+    flown = problem(
+        navigation={"filter": "kalman"}, planner={"kind": "qp", "covariance": asked},
+        mission={"length_m": 12.0}, simulation={"time_limit_s": 5.0},
+    )  # fmt: skip
+    seen: list[Horizon] = []
+
+    class Watch:
+        name = "watch"
+
+        def rows(self, horizon: Horizon) -> LinearRows:
+            seen.append(horizon)
+            return TiltLimit(1.0).rows(horizon)
+
+    planner = QpPlanner(flown, constraints=[*default_constraints(flown), Watch()])
+    simulate(flown, planner, seed=101, runs=2)
+    sigma = np.sqrt(np.array([np.einsum("...ii->...i", horizon.covariance) for horizon in seen[10:]]))
+    grown = 3.0 * (sigma - sigma[:, :, :, :1])
+    assert sigma.shape[1:] == (2, 4, 20, 3)
+    assert (np.diff(sigma, axis=3) >= 0.0).all() or asked == "expected"
+    assert (grown >= -1e-12).all()
+    if asked == "held":
+        np.testing.assert_array_equal(grown, 0.0)
+    elif asked == "expected":
+        assert grown.max() < 0.3
+    else:
+        assert 0.2 < np.median(grown[..., -1, :]) < 0.5
+
+
+def test_unfiltered_covariance_is_held_whatever_is_asked() -> None:
+    """No law says how a reported sigma goes on."""
+    programs = []
+    for asked in ("held", "propagated"):
+        planner = QpPlanner(problem(planner={"kind": "qp", "covariance": asked}))
+        planner.reset(ObstacleSet.empty(), 1)
+        programs.append(planner.build(nav(on_slots(planner), cruising(planner)), 0.0))
+    for one, other in zip(programs[0].rows, programs[1].rows, strict=True):
+        np.testing.assert_array_equal(one.jac, other.jac)
+        np.testing.assert_array_equal(one.lower, other.lower)
+
+
 def test_rows_that_do_not_fit_are_an_error_and_not_a_fall_back() -> None:
     class Wrong:
         name = "wrong"

@@ -36,7 +36,7 @@ from napf_mpc.plot import (
     run_figures,
     scene,
 )
-from napf_mpc.plot.compare import clearance_figure, ecdf, published, risk_figure, trade_figure
+from napf_mpc.plot.compare import clearance_figure, ecdf, published, risk_figure
 from napf_mpc.plot.field import limit_cases, potential_at, surface_figure, walk_figure
 from napf_mpc.plot.flight import MOST_INFLATED, paths_figure, spread, uncertainty_figure
 from napf_mpc.plot.overview import overview_figure
@@ -45,6 +45,7 @@ from napf_mpc.plot.space import space_figure
 from napf_mpc.plot.states import angle_figure, attitude_figure, axis_figure, distance_figure, motion_figure
 from napf_mpc.plot.style import FONT_PT, credit_of, house_style, uav_colour
 from napf_mpc.plot.tracks import SUBSTEPS, Track, acting, clearances, contacts, encounters, separations, track
+from napf_mpc.plot.trade import FINISHED, draw_fronts, fronts_figure, round_up, trade_figure
 from napf_mpc.problem import City, Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.provenance import identity
@@ -512,6 +513,76 @@ def test_trades_show_median_and_percentiles(campaign: tuple[dict[str, Any], dict
     assert [line.get_xdata()[0] for line in figure.axes[0].lines if len(line.get_xdata()) == 2] == [2.5]
 
 
+def spread_of(low: float, median: float, high: float) -> dict[str, float]:
+    return {"p05": low, "median": median, "p95": high}
+
+
+def front_point(risk: float, shape: float, finished: float = 1.0) -> dict[str, Any]:
+    return {
+        "collision_risk": risk,
+        "collision_risk_low": 0.5 * risk,
+        "collision_risk_high": risk + 0.04,
+        "finished": finished,
+        "shape_rms_m": spread_of(shape - 0.5, shape, shape + 1.0),
+        "path_rms_m": spread_of(shape, shape + 1.0, shape + 3.0),
+        "shape_floor_m": spread_of(0.8, 0.9, 1.0),
+    }
+
+
+def fronts() -> dict[str, dict[str, dict[float, dict[str, Any]]]]:
+    return {
+        "8C filter": {
+            "napf": {3.0: front_point(0.04, 3.0), 1.0: front_point(0.3, 1.5)},
+            "qp": {1.0: front_point(0.1, 1.2), 3.0: front_point(0.0, 2.0, finished=FINISHED - 0.01)},
+        },
+        "40C filter": {"napf": {1.0: front_point(0.9, 4.0)}},
+    }
+
+
+def test_fronts_join_the_points_of_a_planner_as_k_grows() -> None:
+    figure = fronts_figure(fronts(), note="N = 9 runs a point")
+    assert [axes.get_title(loc="left") for axes in figure.axes[::2]] == ["(a) 8C filter", "(b) 40C filter"]
+    assert has_line(figure, np.array([1.5, 3.0]), np.array([0.3, 0.04]))  # k = 1, then 3: shape
+    assert has_line(figure, np.array([2.2, 3.0]), np.array([0.1, 0.0]))  # and path of the QP
+    assert (1.0, 1.5, 2.5) in bars(figure, 0)
+    # The risk of 0.3 + 0.04 sets the scale of one cell, that of 0.94 the other's.
+    assert [axes.get_ylim()[1] for axes in figure.axes] == [0.5, 0.5, 1.0, 1.0]
+    hollow = [container.lines[0].get_markerfacecolor() == "white" for container in figure.axes[0].containers]
+    assert hollow == [False, False, False, True]
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["NAPF", "QP", "k = 1", "k = 3"]
+    assert any("hollow: fewer than 95 %" in text.get_text().replace("\n", " ") for text in figure.texts)
+
+
+def test_fronts_are_the_same_files_twice_and_need_a_point(tmp_path: Path) -> None:
+    first = draw_fronts(fronts(), tmp_path / "a", "fronts")
+    assert [path.name for path in first] == ["fronts.png", "fronts.svg"]
+    for one, other in zip(first, draw_fronts(fronts(), tmp_path / "b", "fronts"), strict=True):
+        check_picture(one)
+        assert one.read_bytes() == other.read_bytes()
+    with pytest.raises(ValueError, match="fronts is empty"):
+        fronts_figure({"8C filter": {"napf": {}}})
+
+
+def test_many_planners_leave_room_for_the_note(campaign: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    parts = {name: front_point(0.1, 2.0, 0.5) for name in ("apf", "napf", "napf_guided", "qp", "qp_unguided")}
+    with house_style():
+        figure = trade_figure({"planners": parts})
+        renderer: Any = FigureCanvasAgg(figure).get_renderer()
+        figure.draw(renderer)
+        (legend,), (note,) = figure.legends, figure.texts
+        frames = [axes.get_window_extent() for axes in figure.axes]
+        boxes = [legend.get_window_extent(renderer), note.get_window_extent(renderer)]
+    assert not boxes[0].overlaps(boxes[1])
+    assert not any(frame.overlaps(box) for frame in frames for box in boxes)
+    assert max(box.x1 for box in boxes) <= figure.bbox.x1
+
+
+@pytest.mark.parametrize(("share", "end"), [(0.0, 0.01), (0.037, 0.05), (0.5, 0.5), (0.51, 1.0), (1.0, 1.0)])
+def test_an_axis_of_shares_ends_at_a_round_number(share: float, end: float) -> None:
+    assert round_up(share) == end
+
+
 def test_clearances_are_a_distribution(campaign: tuple[dict[str, Any], dict[str, Any]]) -> None:
     summary, rows = campaign
     figure = clearance_figure(summary, rows)
@@ -639,6 +710,7 @@ def figures_of(
         "walk": walk_figure(goal, goal_scenes(goal)),
         "risk": risk_figure(summary, load_problem("table1_8").reference),
         "trade": trade_figure(summary),
+        "fronts": fronts_figure(fronts(), note="N = 9 runs a point"),
         "clearance": clearance_figure(summary, rows),
         "overview": overview_figure(problem, block.trajectories, lambda run: obstacles, missions),
     }

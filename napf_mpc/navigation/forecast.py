@@ -1,0 +1,249 @@
+r"""How certain of its position the navigation filter will be: its covariance carried ahead by its own model.
+
+A Kalman filter's covariance does not depend on what is measured, so the filter can say beforehand how certain
+it will be: :func:`variance_ahead` carries the ten numbers of each axis (:mod:`napf_mpc.navigation.kalman`)
+from tick to tick as the filter would, either as if no fix came any more, or with the fixes that are to be
+expected: at the epochs at which they come now, with the sigma that they report now, if they are in use now.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.jit import compiled
+from napf_mpc.navigation import kalman
+
+__all__ = ["CovarianceForecast", "ForecastModel", "variance_ahead"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastModel:
+    """What a forecast takes as known, from the filter's model."""
+
+    period_s: float
+    """Length of a tick [s]."""
+    ticks_per_epoch: int
+    """Ticks from one epoch of fixes to the next."""
+    drift: Array
+    """(ticks_per_epoch + 1, 10) an axis over 0, 1, ... ticks: see :func:`drifts`."""
+    error_memory: Array
+    """(3,) correlation of the fix's error from one epoch to the next, on each axis."""
+    error_noise: Array
+    """(3,) variance of what is new in the unit error."""
+    fixless_axis: Mask
+    """(3,) axes that are measured without a fix too (a barometer's)."""
+    position_noise: float
+    """Variance of the white noise in a fix [m^2]."""
+    velocity_noise: float
+    """Variance of the noise in a GNSS velocity [m^2/s^2]."""
+
+
+def drifts(
+    period_s: float, bias_memory: float, velocity_noise: float, bias_noise: float, ticks: int
+) -> Array:
+    """Transition and noise of an axis over 0 to ``ticks`` ticks, all :func:`kalman.predict` at once.
+
+    Returns
+    -------
+    array, shape (ticks + 1, 10)
+        Of the transition: how v and b enter p, how b enters v, and what is left of b. Of the noise: pp, pv,
+        pb, vv, vb, bb.
+    """
+    one = kalman.drift(period_s, bias_memory)
+    drive = np.array([0.5 * period_s, 1.0, 0.0, 0.0])
+    noise = velocity_noise * np.outer(drive, drive)
+    noise[3, 3] = bias_noise
+    out = np.empty((ticks + 1, 10))
+    f, q = np.eye(kalman.STATES), np.zeros((kalman.STATES, kalman.STATES))
+    for n in range(ticks + 1):
+        out[n] = f[0, 1], f[0, 3], f[1, 3], f[3, 3], q[0, 0], q[0, 1], q[0, 3], q[1, 1], q[1, 3], q[3, 3]
+        f, q = one @ f, one @ q @ one.T + noise
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class CovarianceForecast:
+    """All that the filter knows now about how certain it will be. It holds no estimate and no measurement."""
+
+    model: ForecastModel
+    """Constants."""
+    packed: Array
+    """(run, uav, 3, 10) covariance of the states of each axis now."""
+    sigma: Array
+    """(run, uav, 3) sigma of the position that the last epoch of fixes reported [m]."""
+    fixes: Mask
+    """(run, uav) whether fixes are in use: then they are expected to go on."""
+    age: int
+    """Ticks since the last epoch of fixes."""
+    epochs_to_new: int = 1
+    """Epochs until the receiver has a new fix; until then it repeats the last."""
+    epochs_per_new: int = 1
+    """Epochs from one new fix to the next."""
+
+    def variance(self, ahead_s: Array, with_fixes: bool) -> Array:
+        """Variance of the position (run, uav, N, 3) on each axis at times from now [m^2].
+
+        Parameters
+        ----------
+        ahead_s : array, shape (N,)
+            Times from now, >= 0 and increasing, taken to the nearest tick [s].
+        with_fixes : bool
+            Whether fixes and a barometer go on measuring as they do now, or nothing does.
+        """
+        model = self.model
+        ticks = np.rint(np.asarray(ahead_s) / model.period_s).astype(np.int64)
+        out = np.empty((*self.fixes.shape, len(ticks), 3))
+        variance_ahead(
+            self.packed,
+            self.sigma,
+            self.fixes & with_fixes,
+            model.fixless_axis & with_fixes,
+            ticks,
+            model.drift,
+            model.ticks_per_epoch - self.age,
+            self.epochs_to_new,
+            self.epochs_per_new,
+            model.error_memory,
+            model.error_noise,
+            model.position_noise,
+            model.velocity_noise,
+            out,
+        )
+        return out
+
+    def growth(self, ahead_s: Array, with_fixes: bool) -> Array:
+        """By how much the variance (run, uav, N, 3) will exceed that of now, never negative [m^2].
+
+        Parameters are those of :meth:`variance`.
+        """
+        now = self.packed[..., None, :, 0]
+        return np.maximum(self.variance(ahead_s, with_fixes) - now, 0.0)
+
+
+@compiled
+def variance_ahead(
+    packed: Array,
+    sigma: Array,
+    fixes: Mask,
+    fixless_axis: Mask,
+    ticks: NDArray[np.int64],
+    drift: Array,
+    ticks_to_epoch: int,
+    epochs_to_new: int,
+    epochs_per_new: int,
+    error_memory: Array,
+    error_noise: Array,
+    position_noise: float,
+    velocity_noise: float,
+    out: Array,
+) -> None:
+    """Write the variance of the position of each axis at some ticks from now.
+
+    Parameters
+    ----------
+    packed, sigma : array, shapes (run, uav, 3, 10) and (run, uav, 3)
+        Covariances now, and sigma of a fix [m].
+    fixes : array of bool, shape (run, uav)
+        Whether fixes go on.
+    fixless_axis : array of bool, shape (3,)
+        Axes whose position is measured at every epoch, with a fix or without.
+    ticks : array of int, shape (N,)
+        From now, increasing.
+    drift : array, shape (ticks an epoch + 1, 10)
+        From :func:`drifts`.
+    ticks_to_epoch, epochs_to_new, epochs_per_new : int
+        When measurements come.
+    error_memory, error_noise : array, shape (3,)
+        Of the fix's error from one epoch to the next.
+    position_noise, velocity_noise : float
+        Variances of the white noise in position [m^2] and velocity [m^2/s^2].
+    out : array, shape (run, uav, N, 3)
+        Out [m^2].
+    """
+    c = np.empty(kalman.PACKED)
+    period = drift.shape[0] - 1
+    for r in range(packed.shape[0]):
+        for i in range(packed.shape[1]):
+            for a in range(3):
+                c[:] = packed[r, i, a]
+                s = sigma[r, i, a]
+                usable = np.isfinite(s) and s > 0.0
+                now, to_epoch, to_new = 0, ticks_to_epoch, epochs_to_new
+                for k in range(ticks.shape[0]):
+                    while now < ticks[k]:
+                        n = min(ticks[k] - now, to_epoch)
+                        _drift(c, drift[n])
+                        now += n
+                        to_epoch -= n
+                        if to_epoch > 0:
+                            continue
+                        to_epoch = period
+                        to_new -= 1
+                        _forget(c, error_memory[a], error_noise[a])
+                        fix = fixes[r, i] and to_new == 0
+                        if usable and (fix or fixless_axis[a]):
+                            _measured(c, 1.0, 0.0, s, position_noise)
+                        if usable and fix:
+                            _measured(c, 0.0, 1.0, 0.0, velocity_noise)
+                        if to_new == 0:
+                            to_new = epochs_per_new
+                    out[r, i, k, a] = c[0]
+
+
+@compiled
+def _drift(c: Array, step: Array) -> None:
+    """Carry an axis over a number of ticks."""
+    pv_, pb_, vb_, left = step[0], step[1], step[2], step[3]
+    pp, pv, pg, pb = c[0], c[1], c[2], c[3]
+    vv, vg, vb, gb, bb = c[4], c[5], c[6], c[8], c[9]
+    # Rows first: what the new p and v have in common with the old v and b.
+    p_v, p_b = pv + pv_ * vv + pb_ * vb, pb + pv_ * vb + pb_ * bb
+    v_b = vb + vb_ * bb
+    c[0] = pp + pv_ * pv + pb_ * pb + pv_ * p_v + pb_ * p_b + step[4]
+    c[1] = p_v + vb_ * p_b + step[5]
+    c[2] = pg + pv_ * vg + pb_ * gb
+    c[3] = left * p_b + step[6]
+    c[4] = vv + vb_ * vb + vb_ * v_b + step[7]
+    c[5] = vg + vb_ * gb
+    c[6] = left * v_b + step[8]
+    c[8] = left * gb
+    c[9] = left * left * bb + step[9]
+
+
+@compiled
+def _forget(c: Array, memory: float, noise: float) -> None:
+    """Carry the error g from one epoch of fixes to the next."""
+    c[2] *= memory
+    c[5] *= memory
+    c[7] = memory * memory * c[7] + noise
+    c[8] *= memory
+
+
+@compiled
+def _measured(c: Array, h_p: float, h_v: float, h_g: float, noise: float) -> None:
+    """Covariance after a measurement of ``h_p p + h_v v + h_g g``.
+
+    Shorter than the filter's own update, which must stay sound for hours; over a horizon the plain difference
+    does.
+    """
+    p = h_p * c[0] + h_v * c[1] + h_g * c[2]
+    v = h_p * c[1] + h_v * c[4] + h_g * c[5]
+    g = h_p * c[2] + h_v * c[5] + h_g * c[7]
+    b = h_p * c[3] + h_v * c[6] + h_g * c[8]
+    scale = 1.0 / (h_p * p + h_v * v + h_g * g + noise)
+    c[0] -= scale * p * p
+    c[1] -= scale * p * v
+    c[2] -= scale * p * g
+    c[3] -= scale * p * b
+    c[4] -= scale * v * v
+    c[5] -= scale * v * g
+    c[6] -= scale * v * b
+    c[7] -= scale * g * g
+    c[8] -= scale * g * b
+    c[9] -= scale * b * b
