@@ -23,6 +23,7 @@ from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins, sigma_along
 from napf_mpc.jit import compiled
 from napf_mpc.safety_distance import Inflation
+from napf_mpc.vehicle.plant import plain
 from napf_mpc.world.distance import CYLINDER, SPHERE, A
 
 Array = NDArray[np.float64]
@@ -182,11 +183,11 @@ def _choose(
 def _half_space(covariance: Array, normal: Array, inflation: Inflation) -> Array:
     """Margins (run, uav, N, m) against flat walls."""
     if inflation.reading not in ("directional", "chi2"):
-        return np.ascontiguousarray(inflation.margin(covariance, normal))
+        return plain(inflation.margin(covariance, normal))
     size = np.empty(normal.shape[:-1])
     points, m = size[..., 0].size, size.shape[-1]
     _directional(
-        np.ascontiguousarray(covariance).reshape(points, 3, 3),
+        plain(covariance).reshape(points, 3, 3),
         normal.reshape(points, m, 3),
         inflation.k,
         size.reshape(points, m),
@@ -220,8 +221,8 @@ def _exact(horizon: Horizon, index: Index, normal: Array, inflation: Inflation) 
     exact_margins(
         kind.reshape(points, m),
         (shape[..., A] + horizon.problem.vehicle.radius_m).reshape(points, m),
-        np.ascontiguousarray(normal).reshape(points, m, 3),
-        np.ascontiguousarray(horizon.covariance).reshape(points, 3, 3),
+        plain(normal).reshape(points, m, 3),
+        plain(horizon.covariance).reshape(points, 3, 3),
         inflation.k,
         margin.reshape(points, m),
         *_mission(inflation),

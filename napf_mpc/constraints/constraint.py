@@ -14,6 +14,7 @@ from napf_mpc.formation import PathFrame
 from napf_mpc.jit import compiled
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.problem import Problem
+from napf_mpc.vehicle.plant import plain
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -106,14 +107,12 @@ class Horizon:
 
 def along_rows(jac: Array, signal: Array) -> Array:
     """Return jac (run, uav, N, m, dim) . signal (run, uav, N or 1, dim), shape (run, uav, N, m)."""
+    runs, uavs, stages, _, dim = jac.shape
+    if signal.shape != (runs, uavs, 1, dim):
+        signal = np.broadcast_to(signal, (runs, uavs, stages, dim))
     out = np.empty(jac.shape[:-1])
-    _along_rows(_plain(jac), _plain(signal), out)
+    _along_rows(plain(jac), plain(signal), out)
     return out
-
-
-def _plain(values: Array) -> Array:
-    """Return values as one writable block of memory, the only kind that is compiled for."""
-    return values if values.flags.carray else np.array(values, dtype=np.float64, order="C")
 
 
 @compiled
