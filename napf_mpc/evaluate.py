@@ -20,7 +20,7 @@ from napf_mpc.safety_distance import Inflation
 from napf_mpc.vehicle.quadrotor import hover_input
 from napf_mpc.world.distance import COS, SIN, Solids, X, Y, solid_bounds
 from napf_mpc.world.moving_sweep import MovingClearance
-from napf_mpc.world.sweep import SweptClearance, swept_separation
+from napf_mpc.world.sweep import SweptClearance, check_steps, separate
 
 Array = NDArray[np.float64]
 
@@ -103,7 +103,10 @@ class MissionScore:
         self._problem = problem
         self._scenario = scenario
         self._frame = PathFrame.of_mission(mission)
+        self._axes = self._frame.axes
         self._offsets = formation_offsets(problem.formation)
+        self._hover_thrust = float(hover_input(problem.vehicle)[0])
+        self._reform_bound_m = mission.reform_bound_m
         runs, uavs = scenario.initial_state.shape[:2]
         self._clearance = SweptClearance(scenario.obstacles, runs, uavs)
         moving = scenario.moving
@@ -141,18 +144,15 @@ class MissionScore:
 
     def moved(self, time_s: float, before: Array, after: Array, active: Mask) -> None:
         """Sweep one physics step against the solids and the other UAVs."""
-        p0 = np.ascontiguousarray(before[..., POSITION])
-        p1 = np.ascontiguousarray(after[..., POSITION])
-        self._clearance.update(p0, p1, active)
+        p0, p1, active = check_steps(
+            before[..., POSITION], after[..., POSITION], active, self._separation.shape
+        )
+        self._clearance.take_in(p0, p1, active)
         if self._moving is not None:
             self._moving.update(time_s - self._problem.simulation.step_s, time_s, p0, p1, active)
         if time_s > APART_S and p0.shape[1] > 1:
-            nearest = swept_separation(p0, p1)
-            np.minimum(self._separation, nearest, out=self._separation, where=active[:, None])
-        step = p1 - p0
-        length = np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2 + step[..., 2] ** 2)
-        self._flown += np.where(active[:, None], length, 0.0)
-        self._end = np.where(active[:, None], self._frame.along_track(p1), self._end)
+            separate(p0, p1, active, self._separation)
+        _travel(p0, p1, active, self._frame.origin, self._frame.along, self._flown, self._end)
 
     def ticked(
         self, time_s: float, state: Array, nav: NavSolution, command: Command, inputs: Array, active: Mask
@@ -168,10 +168,10 @@ class MissionScore:
             inputs,
             active,
             self._frame.origin,
-            self._frame.axes,
+            self._axes,
             self._offsets,
-            float(hover_input(self._problem.vehicle)[0]),
-            formation_mission(self._problem).reform_bound_m,
+            self._hover_thrust,
+            self._reform_bound_m,
             self._last_obstacle,
             self._sums,
             self._below_since,
@@ -281,6 +281,21 @@ def _finite_or_nan(values: Array) -> Array:
 
 
 _COUNT, _PATH, _SHAPE, _FLOOR, _EFFORT, _FIXES, _WITHIN = 0, 1, 2, 3, 4, 5, 6
+
+
+@compiled
+def _travel(
+    p0: Array, p1: Array, active: Mask, origin: Array, along: Array, flown: Array, end: Array
+) -> None:
+    """Add the way from p0 to p1 (run, uav, 3) to ``flown``, and write the along-track places of its ends."""
+    for r in range(p0.shape[0]):
+        if not active[r]:
+            continue
+        for i in range(p0.shape[1]):
+            x, y, z = p1[r, i, 0] - p0[r, i, 0], p1[r, i, 1] - p0[r, i, 1], p1[r, i, 2] - p0[r, i, 2]
+            flown[r, i] += math.sqrt(x * x + y * y + z * z)
+            u, v, w = p1[r, i, 0] - origin[0], p1[r, i, 1] - origin[1], p1[r, i, 2] - origin[2]
+            end[r, i] = u * along[0] + v * along[1] + w * along[2]
 
 
 @compiled

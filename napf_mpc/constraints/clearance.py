@@ -19,12 +19,15 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
-from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins
+from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows, along_rows
+from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins, sigma_along
+from napf_mpc.jit import compiled
 from napf_mpc.safety_distance import Inflation
+from napf_mpc.vehicle.plant import plain
 from napf_mpc.world.distance import CYLINDER, SPHERE, A
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 Margin = Literal["half_space", "exact"]
 
 CONTACT_W1 = 1000.0
@@ -78,39 +81,131 @@ class Gaps:
         reach = reach_m + radius + inflation.largest_margin(horizon.covariance)
         # An obstacle a little farther off may act more where the error is larger in its direction.
         near = horizon.obstacles.near(
-            horizon.position.reshape(runs, uavs * stages, 3), reach.reshape(runs, uavs * stages), 2 * count
+            horizon.position.reshape(runs, uavs * stages, 3),
+            reach.reshape(runs, uavs * stages),
+            2 * count,
+            together=stages,
         )
-        shape = (runs, uavs, stages, 2 * count)
-        distance = near.distance.reshape(shape) - radius
+        shape, points = (runs, uavs, stages, 2 * count), runs * uavs * stages
         normal, index = near.gradient.reshape(*shape, 3), near.index.reshape(shape)
         if margin == "exact":
             size = _exact(horizon, index, normal, inflation)
         else:
-            size = inflation.margin(horizon.covariance, normal)
-        shifted, influence = inflation.apply(distance, size, rho_0)
-        rank = distance - size
-        none = ~(rank < reach_m)
-        chosen = np.argsort(np.where(none, np.inf, rank), axis=-1, kind="stable")[..., :count]
-        # Rows that keep their places from stage to stage and step to step keep a warm start warm.
-        named = np.where(none, np.iinfo(np.int64).max, index)
-        order = np.argsort(np.take_along_axis(named, chosen, -1), axis=-1, kind="stable")
-        chosen = np.take_along_axis(chosen, order, -1)
-        distance, size, shifted, influence = (
-            np.take_along_axis(values, chosen, -1)
-            for values in (np.where(none, np.inf, distance), size, np.where(none, np.inf, shifted), influence)
+            size = _half_space(horizon.covariance, normal, inflation)
+        kept = (runs, uavs, stages, count)
+        gaps = cls(np.empty(kept), np.empty((*kept, 3)), np.empty(kept), np.empty(kept), np.empty(kept))
+        _choose(
+            near.distance.reshape(points, 2 * count),
+            near.gradient.reshape(points, 2 * count, 3),
+            near.index.reshape(points, 2 * count),
+            size.reshape(points, 2 * count),
+            radius,
+            reach_m,
+            inflation.mode == "shift",
+            rho_0,
+            gaps.distance.reshape(points, count),
+            gaps.normal.reshape(points, count, 3),
+            gaps.margin.reshape(points, count),
+            gaps.shifted.reshape(points, count),
+            gaps.influence.reshape(points, count),
         )
-        normal = np.take_along_axis(np.where(none[..., None], 0.0, normal), chosen[..., None], -2)
-        return cls(distance, normal, size, shifted, influence)
+        return gaps
 
     def rows_beyond(self, position: Array, distance: Array | float) -> tuple[Array, Array]:
         """Coefficients and lower bounds of rows "shifted distance >= distance" on the position."""
-        along = np.zeros(self.shifted.shape)
-        for axis in range(3):
-            along += self.normal[..., axis] * position[..., None, axis]
-        return self.normal, along + (distance - self.shifted)
+        return self.normal, along_rows(self.normal, position) + (distance - self.shifted)
 
 
-def _exact(horizon: Horizon, index: NDArray[np.int64], normal: Array, inflation: Inflation) -> Array:
+@compiled
+def _choose(
+    distance: Array,
+    normal: Array,
+    index: Index,
+    size: Array,
+    radius: float,
+    reach_m: float,
+    shift: bool,
+    rho_0: float,
+    out_distance: Array,
+    out_normal: Array,
+    out_size: Array,
+    out_shifted: Array,
+    out_influence: Array,
+) -> None:
+    """Keep the few obstacles of each point that are nearest by shifted distance, as :class:`Gaps` holds them.
+
+    Parameters
+    ----------
+    distance, normal, index, size : array, shapes (point, m), (point, m, 3), (point, m) and (point, m)
+        As the map answers, nearest first, and margins.
+    radius, reach_m : float
+        Of the UAV, and the shifted distance from which on an obstacle counts as none [m].
+    shift : bool
+        Whether the margin shifts the distance; otherwise it widens the range.
+    rho_0 : float
+        Range of influence [m].
+    """
+    m, few = distance.shape[1], out_distance.shape[1]
+    rank, place = np.empty(m), np.empty(m, dtype=np.int64)
+    for p in range(distance.shape[0]):
+        for j in range(m):
+            by = distance[p, j] - radius - size[p, j]
+            rank[j] = by if by < reach_m else np.inf
+        # By rank, equals as they came, ...
+        for j in range(m):
+            at = j
+            while at > 0 and rank[place[at - 1]] > rank[j]:
+                place[at] = place[at - 1]
+                at -= 1
+            place[at] = j
+        # ... then the chosen by index: rows that keep their places from stage to stage and step to step keep
+        # a warm start warm. Those that count as none come last.
+        for j in range(1, few):
+            mine, at = place[j], j
+            if rank[mine] == np.inf:
+                break
+            while at > 0 and index[p, place[at - 1]] > index[p, mine]:
+                place[at] = place[at - 1]
+                at -= 1
+            place[at] = mine
+        for j in range(few):
+            i = place[j]
+            none = rank[i] == np.inf
+            gap = distance[p, i] - radius
+            out_size[p, j] = size[p, i]
+            out_distance[p, j] = np.inf if none else gap
+            out_shifted[p, j] = np.inf if none else gap - size[p, i] if shift else gap
+            out_influence[p, j] = rho_0 if shift else rho_0 + size[p, i]
+            for axis in range(3):
+                out_normal[p, j, axis] = 0.0 if none else normal[p, i, axis]
+
+
+def _half_space(covariance: Array, normal: Array, inflation: Inflation) -> Array:
+    """Margins (run, uav, N, m) against flat walls."""
+    if inflation.reading not in ("directional", "chi2"):
+        return plain(inflation.margin(covariance, normal))
+    points, m = math.prod(normal.shape[:-2]), normal.shape[-2]
+    size = np.empty(normal.shape[:-1])
+    _directional(
+        plain(covariance).reshape(points, 3, 3),
+        normal.reshape(points, m, 3),
+        inflation.k,
+        size.reshape(points, m),
+    )
+    return size
+
+
+@compiled
+def _directional(covariance: Array, normal: Array, k: float, size: Array) -> None:
+    """Write k sigma along normals: covariance (point, 3, 3), normal (point, m, 3), size (point, m)."""
+    for p in range(normal.shape[0]):
+        for j in range(normal.shape[1]):
+            x, y, z = normal[p, j, 0], normal[p, j, 1], normal[p, j, 2]
+            none = x == 0.0 and y == 0.0 and z == 0.0
+            size[p, j] = 0.0 if none else k * sigma_along(covariance[p], x, y, z)
+
+
+def _exact(horizon: Horizon, index: Index, normal: Array, inflation: Inflation) -> Array:
     """Margins (run, uav, N, m) against the spheres and cylinders that are there."""
     world = horizon.obstacles
     if len(world) == 0:
@@ -126,8 +221,8 @@ def _exact(horizon: Horizon, index: NDArray[np.int64], normal: Array, inflation:
     exact_margins(
         kind.reshape(points, m),
         (shape[..., A] + horizon.problem.vehicle.radius_m).reshape(points, m),
-        np.ascontiguousarray(normal).reshape(points, m, 3),
-        np.ascontiguousarray(horizon.covariance).reshape(points, 3, 3),
+        plain(normal).reshape(points, m, 3),
+        plain(horizon.covariance).reshape(points, 3, 3),
         inflation.k,
         margin.reshape(points, m),
         *_mission(inflation),

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from napf_mpc.errors import NapfError
 from napf_mpc.formation import PathFrame
+from napf_mpc.jit import compiled
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.problem import Problem
+from napf_mpc.vehicle.plant import plain
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -103,6 +105,31 @@ class Horizon:
             raise ConstraintError("horizon: " + "; ".join(faults))
 
 
+def along_rows(jac: Array, signal: Array) -> Array:
+    """Return jac (run, uav, N, m, dim) . signal (run, uav, N or 1, dim), shape (run, uav, N, m)."""
+    runs, uavs, stages, _, dim = jac.shape
+    if signal.shape != (runs, uavs, 1, dim):
+        signal = np.broadcast_to(signal, (runs, uavs, stages, dim))
+    out = np.empty(jac.shape[:-1])
+    _along_rows(plain(jac), plain(signal), out)
+    return out
+
+
+@compiled
+def _along_rows(jac: Array, signal: Array, out: Array) -> None:
+    runs, uavs, stages, count, dim = jac.shape
+    for run in range(runs):
+        for uav in range(uavs):
+            for k in range(stages):
+                x = signal[run, uav, k if signal.shape[2] > 1 else 0]
+                for j in range(count):
+                    # One axis after the other: a library's sum may differ in the last bit with the batch.
+                    total = 0.0
+                    for axis in range(dim):
+                        total += jac[run, uav, k, j, axis] * x[axis]
+                    out[run, uav, k, j] = total
+
+
 @dataclass(frozen=True, eq=False)
 class LinearRows:
     """Rows ``lower <= jac . signal <= upper`` of every run, UAV and stage, hard or soft.
@@ -144,11 +171,7 @@ class LinearRows:
 
     def values(self, signal: Array) -> Array:
         """Return jac . signal of a signal (run, uav, N, dim), shape (run, uav, N, m)."""
-        total = np.zeros(self.jac.shape[:-1])
-        # One axis after the other: a contraction by BLAS may differ in the last bit with the batch.
-        for axis in range(self.jac.shape[-1]):
-            total += self.jac[..., axis] * signal[..., None, axis]
-        return total
+        return along_rows(self.jac, signal)
 
     def violation(self, signal: Array) -> Array:
         """Return how far a signal (run, uav, N, dim) is outside each row's bounds, >= 0, (run, uav, N, m)."""

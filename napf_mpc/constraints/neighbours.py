@@ -9,17 +9,23 @@ from the centre is d_n. Two UAVs that keep ``n^T (p_i - p_j) >= d_n + k sqrt(n^T
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
+from napf_mpc.constraints.probability import sigma_along
 from napf_mpc.formation import PathFrame, formation_offsets
-from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.jit import compiled
+from napf_mpc.problem import Formation, FormationMission, Problem
 from napf_mpc.safety_distance import Inflation, directional_sigma
+from napf_mpc.vehicle.plant import plain
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 SEPARATION_W1 = 1000.0
 """Linear price of a separation slack [1/(m s)]; as for obstacles, a hit is a hit."""
@@ -141,54 +147,186 @@ class NeighbourSeparation:
         """Rows on the position, one for each of the nearest neighbours of each stage [m]."""
         runs, uavs, stages = horizon.shape
         inflation = self.inflation or Inflation.of_problem(horizon.problem)
-        distance_m = _distance(self.distance_m, horizon.problem)
-        # Axes (run, stage, uav, neighbour): a plan against all others at the same stage.
-        position = horizon.position.transpose(0, 2, 1, 3)
-        offset = position[:, :, :, None, :] - position[:, :, None, :, :]
-        normal, reach = tangent(offset, distance_m, self.stretch, _aside(uavs, horizon.frame))
+        shape = (runs, uavs, stages, self.neighbours)
+        jac, lower = np.zeros((*shape, 3)), np.full(shape, -np.inf)
+        along_normal = inflation.reading in ("directional", "chi2")
+        _separate(
+            plain(horizon.position),
+            plain(horizon.covariance),
+            _cross(horizon.common_factor),
+            np.empty((0, 0, 0, 0)) if along_normal else self._even_margin(horizon, inflation),
+            inflation.k,
+            _distance(self.distance_m, horizon.problem),
+            self.stretch,
+            _aside(uavs, horizon.frame),
+            self._most_by_slots(horizon),
+            np.inf if self.opening_mps is None else self.opening_mps,
+            np.cumsum(horizon.step_s),
+            self.share,
+            self.reach_m,
+            jac,
+            lower,
+        )
+        return LinearRows("position", jac, lower, None, np.full(shape, self.w1), np.full(shape, self.w2))
+
+    def _even_margin(self, horizon: Horizon, inflation: Inflation) -> Array:
+        """Margins (run, N, uav, neighbour) by readings that ask for the same in all directions [m]."""
         relative = relative_covariance(
             horizon.covariance.transpose(0, 2, 1, 3, 4), horizon.common_factor[:, None]
         )
-        required = reach + _margin(inflation, relative, normal)
-        required = np.maximum(reach, np.minimum(required, self._largest(horizon, offset[:, :1])))
-        gap = _dot(normal, offset)
-        spare = gap - required
-        spare[..., np.arange(uavs), np.arange(uavs)] = np.inf
-        spare = np.where(spare < self.reach_m, spare, np.inf)
+        return plain(_margin(inflation, relative, np.broadcast_to(0.0, relative.shape[:-1])))
 
-        chosen = np.argsort(spare, axis=-1, kind="stable")[..., : self.neighbours]
-        # Rows that keep their places from stage to stage and step to step keep a warm start warm.
-        taken = np.take_along_axis(spare, chosen, -1)
-        order = np.argsort(np.where(np.isfinite(taken), chosen, uavs), axis=-1, kind="stable")
-        chosen, spare = np.take_along_axis(chosen, order, -1), np.take_along_axis(taken, order, -1)
-        active = np.isfinite(spare)
-        jac = np.where(active[..., None], np.take_along_axis(normal, chosen[..., None], -2), 0.0)
-        lower = np.where(active, _dot(jac, position[..., None, :]) - self.share * spare, -np.inf)
+    def _most_by_slots(self, horizon: Horizon) -> Array:
+        """Most that is asked of pairs (uav, neighbour) because of the distance of their slots [m]."""
+        pairs = (horizon.shape[1],) * 2
+        if self.slot_part is None:
+            return np.full(pairs, np.inf)
+        apart = slot_offsets(horizon.problem, horizon.frame)
+        return plain(np.broadcast_to(self.slot_part * np.sqrt(_dot(apart, apart)), pairs))
 
-        shape = (runs, uavs, stages, self.neighbours)
-        found = jac.shape[-2]
-        padded_jac, padded_lower = np.zeros((*shape, 3)), np.full(shape, -np.inf)
-        padded_jac[..., :found, :] = jac.transpose(0, 2, 1, 3, 4)
-        padded_lower[..., :found] = lower.transpose(0, 2, 1, 3)
-        return LinearRows(
-            "position", padded_jac, padded_lower, None, np.full(shape, self.w1), np.full(shape, self.w2)
-        )
 
-    def _largest(self, horizon: Horizon, offset: Array) -> Array:
-        """Most that is asked of pairs (run, N, uav, neighbour), whose offset now is (run, 1, uav, uav, 3)."""
-        most = np.full((1, 1, 1, 1), np.inf)
-        if self.slot_part is not None:
-            apart = slot_offsets(horizon.problem, horizon.frame)
-            most = self.slot_part * np.sqrt(_dot(apart, apart))
-        if self.opening_mps is not None:
-            now = np.sqrt(_dot(offset, offset))
-            most = np.minimum(most, now + self.opening_mps * np.cumsum(horizon.step_s)[:, None, None])
-        return most
+def _cross(common_factor: Array) -> Array:
+    """Sigma_ij + Sigma_ij^T of all pairs, (run, uav, neighbour, 3, 3) [m^2]."""
+    runs, uavs = common_factor.shape[:2]
+    cross = np.empty((runs, uavs, uavs, 3, 3))
+    _shared(plain(common_factor), cross)
+    return cross
+
+
+@compiled
+def _shared(factor: Array, cross: Array) -> None:
+    """Write L_i L_j^T + L_j L_i^T of factors (run, uav, 3, rank)."""
+    one = np.empty((3, 3))
+    for run in range(cross.shape[0]):
+        for i in range(cross.shape[1]):
+            for j in range(cross.shape[1]):
+                one[:] = 0.0
+                for c in range(factor.shape[3]):
+                    for a in range(3):
+                        for b in range(3):
+                            one[a, b] += factor[run, i, a, c] * factor[run, j, b, c]
+                for a in range(3):
+                    for b in range(3):
+                        cross[run, i, j, a, b] = one[a, b] + one[b, a]
+
+
+@compiled
+def _plane(
+    x: float, y: float, z: float, distance_m: float, stretch: float, aside: Array, normal: Array
+) -> float:
+    """Write the normal that :func:`tangent` returns of an offset (x, y, z), and return its reach [m]."""
+    flattened = z / stretch**2
+    if math.sqrt(x * x + y * y + z * z) < TOUCH_M:
+        normal[:] = aside
+    else:
+        length = math.sqrt(x * x + y * y + flattened * flattened)
+        normal[0], normal[1], normal[2] = x / length, y / length, flattened / length
+    level = normal[0] * normal[0] + normal[1] * normal[1]
+    tall = stretch * normal[2]
+    return distance_m * math.sqrt(level + tall * tall)
+
+
+@compiled
+def _separate(
+    position: Array,
+    covariance: Array,
+    cross: Array,
+    margin: Array,
+    k: float,
+    distance_m: float,
+    stretch: float,
+    aside: Array,
+    most_by_slots: Array,
+    opening_mps: float,
+    times_s: Array,
+    share: float,
+    reach_m: float,
+    jac: Array,
+    lower: Array,
+) -> None:
+    """Write rows against the nearest neighbours of every stage.
+
+    Parameters
+    ----------
+    position, covariance : array, shapes (run, uav, N, 3) and (run, uav, N, 3, 3)
+        As planned, and their errors.
+    cross : array, shape (run, uav, uav, 3, 3)
+        What errors of pairs have in common, both ways round.
+    margin : array, shape (run, N, uav, uav), or without entries
+        Margins [m]; without, k sigma along the normal.
+    aside : array, shape (uav, uav, 3)
+        Normals of pairs in the same place.
+    most_by_slots : array, shape (uav, uav)
+        Most that is asked of each pair [m].
+    times_s : array, shape (N,)
+        Ends of the stages [s].
+    jac, lower : array, shapes (run, uav, N, m, 3) and (run, uav, N, m)
+        Rows; switched off as they come.
+    """
+    runs, uavs, stages = position.shape[:3]
+    few = min(lower.shape[3], uavs)
+    normal, spare = np.empty((uavs, uavs, 3)), np.full((uavs, uavs), np.inf)
+    relative, nearest = np.empty((3, 3)), np.empty(uavs, dtype=np.int64)
+    start = np.empty((uavs, uavs))
+    for run in range(runs):
+        for s in range(stages):
+            for i in range(uavs):
+                for j in range(i):
+                    # Seen from j all is the same, with the normal turned round.
+                    x = position[run, i, s, 0] - position[run, j, s, 0]
+                    y = position[run, i, s, 1] - position[run, j, s, 1]
+                    z = position[run, i, s, 2] - position[run, j, s, 2]
+                    reach = _plane(x, y, z, distance_m, stretch, aside[i, j], normal[i, j])
+                    nx, ny, nz = normal[i, j, 0], normal[i, j, 1], normal[i, j, 2]
+                    normal[j, i, 0], normal[j, i, 1], normal[j, i, 2] = -nx, -ny, -nz
+                    if s == 0:
+                        start[i, j] = math.sqrt(x * x + y * y + z * z)
+                    if margin.size > 0:
+                        extra = margin[run, s, i, j]
+                    else:
+                        for a in range(3):
+                            for b in range(3):
+                                both = covariance[run, i, s, a, b] + covariance[run, j, s, a, b]
+                                relative[a, b] = both - cross[run, i, j, a, b]
+                        extra = k * sigma_along(relative, nx, ny, nz)
+                    most = min(most_by_slots[i, j], start[i, j] + opening_mps * times_s[s])
+                    required = max(reach, min(reach + extra, most))
+                    left = (nx * x + ny * y + nz * z) - required
+                    spare[i, j] = spare[j, i] = left if left < reach_m else np.inf
+            for i in range(uavs):
+                found = 0
+                # The nearest, equals by index, ...
+                for j in range(uavs):
+                    if spare[i, j] == np.inf:
+                        continue
+                    at = min(found, few)
+                    while at > 0 and spare[i, nearest[at - 1]] > spare[i, j]:
+                        at -= 1
+                    if at < few:
+                        for later in range(min(found, few - 1), at, -1):
+                            nearest[later] = nearest[later - 1]
+                        nearest[at] = j
+                    found = min(found + 1, few)
+                # ... in the order of their indices: rows that keep their places from stage to stage and step
+                # to step keep a warm start warm.
+                for m in range(1, found):
+                    j, at = nearest[m], m
+                    while at > 0 and nearest[at - 1] > j:
+                        nearest[at] = nearest[at - 1]
+                        at -= 1
+                    nearest[at] = j
+                for m in range(found):
+                    j = nearest[m]
+                    at_rest = 0.0
+                    for a in range(3):
+                        jac[run, i, s, m, a] = normal[i, j, a]
+                        at_rest += normal[i, j, a] * position[run, i, s, a]
+                    lower[run, i, s, m] = at_rest - share * spare[i, j]
 
 
 def slot_offsets(problem: Problem, frame: PathFrame) -> Array:
     """From each slot of the formation to each other one, (uav, uav, 3) in the world [m]."""
-    slots = frame.to_world(formation_offsets(problem.formation))
+    slots = frame.to_world(_slots(problem.formation))
     return np.asarray(slots[:, None, :] - slots[None, :, :])
 
 
@@ -200,7 +338,7 @@ def margin_attainable(
     inflation: Inflation | None = None,
     distance_m: float | None = None,
     stretch: float = 1.0,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Whether UAVs that sit on their slots are as far apart as the margins ask (three sigma of 5 m are not, in a 10 m square).
 
     Where it is False, the separation rows will always ask for slack: widen the formation, lower the
@@ -224,17 +362,60 @@ def margin_attainable(
     """  # noqa: E501
     if not isinstance(problem.mission, FormationMission):
         raise ConstraintError('mission.kind must be "formation": a lone point has no neighbours')
-    frame = PathFrame.of_mission(problem.mission)
-    offset = slot_offsets(problem, frame)
-    uavs = len(offset)
-    normal, reach = tangent(offset, _distance(distance_m, problem), stretch, _aside(uavs, frame))
-    relative = relative_covariance(covariance, common_factor)
-    margin = _margin(
-        inflation or Inflation.of_problem(problem),
-        relative,
-        np.broadcast_to(normal, relative.shape[:-1]),
+    distance_m = _distance(distance_m, problem)
+    normal, room, reach = _between_slots(problem.formation, problem.mission, distance_m, stretch)
+    inflation, uavs = inflation or Inflation.of_problem(problem), len(room)
+    if inflation.reading not in ("directional", "chi2"):
+        relative = relative_covariance(covariance, common_factor)
+        margin = _margin(inflation, relative, np.broadcast_to(normal, relative.shape[:-1]))
+        return np.asarray((room >= reach + margin) | np.eye(uavs, dtype=bool))
+    lead = covariance.shape[:-3]
+    kept = np.empty((math.prod(lead), uavs, uavs), dtype=np.bool_)
+    factor = common_factor.reshape(len(kept), *common_factor.shape[-3:])
+    _keeps(
+        plain(covariance.reshape(len(kept), uavs, 3, 3)),
+        _cross(factor),
+        inflation.k,
+        normal,
+        room,
+        reach,
+        kept,
     )
-    return np.asarray((_dot(normal, offset) >= reach + margin) | np.eye(uavs, dtype=bool))
+    return kept.reshape(*lead, uavs, uavs)
+
+
+@compiled
+def _keeps(
+    covariance: Array, cross: Array, k: float, normal: Array, room: Array, reach: Array, kept: Mask
+) -> None:
+    """Write whether pairs have room (uav, uav) for their reach and k sigma along their normals."""
+    relative = np.empty((3, 3))
+    for run in range(kept.shape[0]):
+        for i in range(kept.shape[1]):
+            for j in range(kept.shape[1]):
+                for a in range(3):
+                    for b in range(3):
+                        both = covariance[run, i, a, b] + covariance[run, j, a, b]
+                        relative[a, b] = both - cross[run, i, j, a, b]
+                margin = k * sigma_along(relative, normal[i, j, 0], normal[i, j, 1], normal[i, j, 2])
+                kept[run, i, j] = i == j or room[i, j] >= reach[i, j] + margin
+
+
+@lru_cache(maxsize=16)
+def _between_slots(
+    formation: Formation, mission: FormationMission, distance_m: float, stretch: float
+) -> tuple[Array, Array, Array]:
+    """Planes between the slots of a formation: normals, the slots' distance along them, and reach."""
+    frame = PathFrame.of_mission(mission)
+    slots = frame.to_world(_slots(formation))
+    offset = slots[:, None, :] - slots[None, :, :]
+    normal, reach = tangent(offset, distance_m, stretch, _aside(len(offset), frame))
+    return normal, _dot(normal, offset), reach
+
+
+@lru_cache(maxsize=16)
+def _slots(formation: Formation) -> Array:
+    return formation_offsets(formation)
 
 
 def _distance(distance_m: float | None, problem: Problem) -> float:

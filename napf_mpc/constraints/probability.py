@@ -76,6 +76,19 @@ def ellipsoid_half_space_bound(offset: Array, covariance: Array, half_axes: Arra
 
 
 @compiled
+def sigma_along(c: Array, x: float, y: float, z: float) -> float:
+    """Standard deviation along a unit vector of an error of covariance c (3, 3) [m].
+
+    The compiled twin of :func:`napf_mpc.safety_distance.directional_sigma`, to the last bit.
+    """
+    variance = c[0, 0] * x * x + c[1, 1] * y * y + c[2, 2] * z * z
+    variance = variance + (c[0, 1] + c[1, 0]) * x * y
+    variance = variance + (c[0, 2] + c[2, 0]) * x * z
+    variance = variance + (c[1, 2] + c[2, 1]) * y * z
+    return math.sqrt(max(variance, 0.0))
+
+
+@compiled
 def reach_probability(
     kind: int, radius: float, distance: float, sigma: float, g: float
 ) -> tuple[float, float]:

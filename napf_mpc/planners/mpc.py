@@ -15,6 +15,7 @@ from napf_mpc.constraints.moving import MovingObstacleContact
 from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
+from napf_mpc.jit import compiled
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
@@ -187,7 +188,8 @@ class QpPlanner:
         causes = np.where(trusted, causes, np.where(airborne, "navigation", ""))
         flown, action = self._choose(time_s, state, answer, accepted, trusted & ~upset, causes)
         self._plan, self._answer = flown, answer
-        self._count(answer, action, accepted, trusted, airborne)
+        slack = self._contact_slack(answer, accepted)
+        self._count(answer, slack, action, accepted, trusted, airborne)
         self._count_short_margins(nav, trusted)
         on_plan = action <= Action.TAIL
         down = np.where(action == Action.DESCEND, -DESCENT_MPS, 0.0)[..., None] * self._frame.up
@@ -205,7 +207,7 @@ class QpPlanner:
             plan=flown,
             planned=on_plan,
             reason=reason,
-            slack_m=self._contact_slack(answer, accepted),
+            slack_m=slack,
             solver_status=_WORDS[answer.status],
         )
 
@@ -234,8 +236,8 @@ class QpPlanner:
         return Horizon(
             time_s=time_s,
             step_s=self._model.step_s,
-            position=guess[..., POSITION],
-            velocity=guess[..., VELOCITY],
+            position=np.ascontiguousarray(guess[..., POSITION]),
+            velocity=np.ascontiguousarray(guess[..., VELOCITY]),
             covariance=np.where(known[..., None], self._covariance(nav), np.eye(3)),
             common_factor=np.where(known, nav.common_factor, 0.0),
             obstacles=self._obstacles,
@@ -253,21 +255,19 @@ class QpPlanner:
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
-        origin = state[..., POSITION]
+        origin = np.ascontiguousarray(state[..., POSITION])
         blocks: list[LinearRows] = [constraint.rows(horizon) for constraint in self.constraints]
         for constraint, block in zip(self.constraints, blocks, strict=True):
             block.check_shapes(horizon.shape, constraint.name)
         blocks = [block.shifted(origin) if block.signal == "position" else block for block in blocks]
-        return HorizonQp(
-            self._model, _moved(state, -origin), _moved(reference, -origin[:, :, None]), tuple(blocks)
-        )
+        return HorizonQp(self._model, _moved(state, -origin), _moved(reference, -origin), tuple(blocks))
 
     def _solve(
         self, state: Array, reference: Array, nav: NavSolution, trusted: Mask, time_s: float
     ) -> BatchResult:
         """Answers in the world's coordinates, after as many passes as the problem asks for."""
         states, inputs = self._guess(state, reference, time_s)
-        origin, answer = state[:, :, None, POSITION], self._answer
+        origin, answer = np.ascontiguousarray(state[..., POSITION]), self._answer
         asked: Mask = np.asarray(trusted.any(-1))
         for turn in range(self.problem.planner.passes):
             if turn and answer is not None:
@@ -301,18 +301,20 @@ class QpPlanner:
     ) -> tuple[Plan, Codes]:
         """Plans that fly from now on, and by which rung of the ladder."""
         old, step_s = self._plan, self._model.step_s
-        still = standing_plan(self.problem.vehicle, self._yaw, time_s, step_s, self._anchor)
         new = Plan(
             self.problem.vehicle, self._yaw, time_s, step_s, state,
-            _moved(answer.states, state[:, :, None, POSITION]), answer.inputs,
+            _moved(answer.states, np.ascontiguousarray(state[..., POSITION])), answer.inputs,
         )  # fmt: skip
         if accepted.all():
             self._made_s[:] = time_s
             no_need = np.zeros(accepted.shape, dtype=bool)
             return new, self.ladder.decide(time_s, accepted, self._made_s, no_need, causes)
-        tail = still if old is None else old.resumed(time_s, step_s)
+        still = standing_plan(self.problem.vehicle, self._yaw, time_s, step_s, self._anchor)
         # Without navigation nothing tells whether the tail is followed; upset, it cannot be.
-        clear = sound & (self._clearance(tail) >= 0.0)
+        clear, tail = sound & ~accepted, still
+        if clear.any():
+            tail = still if old is None else old.resumed(time_s, step_s)
+            clear &= self._clearance(tail) >= 0.0
         action = self.ladder.decide(time_s, accepted, time_s - self._made_s, clear, causes)
         self._made_s = np.where(accepted, time_s, self._made_s)
         return new.where(accepted, tail.where(action == Action.TAIL, still)), action
@@ -329,17 +331,19 @@ class QpPlanner:
         return np.asarray(least - self.problem.vehicle.radius_m)
 
     def _count(
-        self, answer: BatchResult, action: Codes, accepted: Mask, trusted: Mask, airborne: Mask
+        self, answer: BatchResult, slack: Array, action: Codes, accepted: Mask, trusted: Mask, airborne: Mask
     ) -> None:
         tally = self.tally
-        for status in COUNTED:
-            tally.add(f"solves_{status.value}", trusted & (answer.status == STATUSES.index(status)))
+        for code in set(answer.status[trusted].tolist()):
+            if STATUSES[code] in COUNTED:
+                tally.add(f"solves_{STATUSES[code].value}", trusted & (answer.status == code))
         tally.add("iterations", trusted, np.maximum(answer.iterations, 0))
-        tally.add("answers_refused", trusted & ~accepted)
+        if (trusted & ~accepted).any():
+            tally.add("answers_refused", trusted & ~accepted)
         for rung, name in enumerate(FALL_BACKS, start=1):
-            tally.add(f"fall_back_{name}", airborne & (action == rung))
-        slack = np.fmax.reduce(self._contact_slack(answer, accepted), axis=-1)
-        np.fmax(tally.largest_slack_m, slack, out=tally.largest_slack_m)
+            if (airborne & (action == rung)).any():
+                tally.add(f"fall_back_{name}", airborne & (action == rung))
+        np.fmax(tally.largest_slack_m, np.fmax.reduce(slack, axis=-1), out=tally.largest_slack_m)
 
     def _contact_slack(self, answer: BatchResult, accepted: Mask) -> Array:
         """Most that each new plan (run, uav) is inside an obstacle's margin, NaN without one [m]."""
@@ -370,7 +374,19 @@ def _sigma(nav: NavSolution, trusted: Mask) -> Array:
 
 
 def _moved(states: Array, by: Array) -> Array:
-    """States (..., 12) with their positions moved by (..., 3)."""
-    out = states.copy()
-    out[..., POSITION] += by
+    """States (run, uav, ..., 12) with their positions moved by (run, uav, 3), the same at all stages."""
+    out = np.empty(states.shape)
+    runs, uavs = states.shape[:2]
+    _move(states.reshape(runs, uavs, -1, STATES), by, out.reshape(runs, uavs, -1, STATES))
     return out
+
+
+@compiled
+def _move(states: Array, by: Array, out: Array) -> None:
+    for run in range(states.shape[0]):
+        for uav in range(states.shape[1]):
+            for k in range(states.shape[2]):
+                for i in range(STATES):
+                    out[run, uav, k, i] = states[run, uav, k, i]
+                for axis in range(3):
+                    out[run, uav, k, 2 * axis] += by[run, uav, axis]

@@ -8,8 +8,12 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from napf_mpc.jit import compiled
 from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult
+from napf_mpc.vehicle.plant import plain
+
+Mask = NDArray[np.bool_]
 
 PRIMAL_LIMIT = 0.01
 """Largest violation of a row [m, m/s, rad or N]: a centimetre is a thirtieth of a UAV's radius, a centimetre
@@ -106,16 +110,21 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
     array of int8, shape (run, uav)
         Codes of :class:`Refusal`.
     """
-    thrusts = np.zeros((*result.inputs.shape[:-1], len(limits.input_lower)))
-    for axis in range(INPUTS):
-        thrusts += limits.input_matrix[:, axis] * result.inputs[..., axis, None]
-    inside = (thrusts >= limits.input_lower - INPUT_TOLERANCE_N).all(axis=(2, 3))
-    inside &= (thrusts <= limits.input_upper + INPUT_TOLERANCE_N).all(axis=(2, 3))
-    finite = np.isfinite(result.states).all(axis=(2, 3)) & np.isfinite(result.inputs).all(axis=(2, 3))
-    for slack in result.slacks:
-        finite &= np.isfinite(slack).all(axis=(2, 3))
-    # A row that is off by what a row may be off costs its multiplier times that.
-    push = np.abs(result.y[..., result.states.shape[-2] * STATES :]).max(-1, initial=0.0)
+    inside = np.empty(result.status.shape, dtype=np.bool_)
+    _inputs_inside(
+        result.inputs,
+        limits.input_matrix,
+        limits.input_lower - INPUT_TOLERANCE_N,
+        limits.input_upper + INPUT_TOLERANCE_N,
+        inside,
+    )
+    finite = np.ones(result.status.shape, dtype=np.bool_)
+    for values in (result.states, result.inputs, *result.slacks):
+        if values.size:
+            _all_finite(values, finite)
+    balanced = np.empty(result.status.shape, dtype=np.bool_)
+    first = result.states.shape[-2] * STATES
+    _balanced(plain(result.y), first, plain(result.complementarity), limits.complementarity, balanced)
     # Each test must hold to pass: NaN fails all of them.
     tests = (
         (Refusal.SKIPPED, result.status != STATUSES.index(QpStatus.SKIPPED)),
@@ -124,12 +133,56 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
         (Refusal.INPUT, inside),
         (Refusal.PRIMAL, result.primal <= limits.primal),
         (Refusal.DUAL, result.dual <= limits.dual),
-        (Refusal.COMPLEMENTARITY, result.complementarity <= limits.complementarity + PRIMAL_LIMIT * push),
+        (Refusal.COMPLEMENTARITY, balanced),
     )
     why = np.full(result.status.shape, Refusal.NONE, dtype=np.int8)
     for refusal, passed in reversed(tests):
         why[~passed] = refusal
     return why
+
+
+@compiled
+def _inputs_inside(inputs: Array, matrix: Array, lower: Array, upper: Array, inside: Mask) -> None:
+    """Write whether all inputs (run, uav, N, 4) keep rows between bounds; NaN does not."""
+    for run in range(inputs.shape[0]):
+        for uav in range(inputs.shape[1]):
+            keeps = True
+            for k in range(inputs.shape[2]):
+                for i in range(len(lower)):
+                    value = 0.0
+                    for axis in range(inputs.shape[3]):
+                        value += matrix[i, axis] * inputs[run, uav, k, axis]
+                    keeps = keeps and lower[i] <= value <= upper[i]
+            inside[run, uav] = keeps
+
+
+@compiled
+def _all_finite(values: Array, finite: Mask) -> None:
+    """Clear ``finite`` (run, uav) where a number of values (run, uav, N, m) is not."""
+    for run in range(values.shape[0]):
+        for uav in range(values.shape[1]):
+            for k in range(values.shape[2]):
+                for i in range(values.shape[3]):
+                    if not np.isfinite(values[run, uav, k, i]):
+                        finite[run, uav] = False
+
+
+@compiled
+def _balanced(y: Array, first: int, complementarity: Array, limit: float, balanced: Mask) -> None:
+    """Write whether complementarity (run, uav) is small beside the multipliers y (run, uav, m) of the rows.
+
+    A row that is off by what a row may be off costs its multiplier times that. NaN is never balanced.
+    """
+    for run in range(y.shape[0]):
+        for uav in range(y.shape[1]):
+            missing = 0
+            for i in range(first, y.shape[2]):
+                missing += y[run, uav, i] != y[run, uav, i]
+            push = 0.0
+            if not complementarity[run, uav] <= limit:
+                for i in range(first, y.shape[2]):
+                    push = max(push, abs(y[run, uav, i]))
+            balanced[run, uav] = missing == 0 and complementarity[run, uav] <= limit + PRIMAL_LIMIT * push
 
 
 def accepted(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.bool_]:

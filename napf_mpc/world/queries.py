@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
 from napf_mpc.world.bounding_tree import STACK, BoxTree, box_distance
-from napf_mpc.world.distance import Solids, signed_distance
+from napf_mpc.world.distance import BASE, SPHERE, A, Solids, X, Y, ball_distance, length3, signed_distance
 
 
 @compiled
@@ -187,58 +187,175 @@ def near_all(
     scene_start: NDArray[np.int64],
     points: NDArray[np.float64],
     reaches: NDArray[np.float64],
+    together: int,
     distance: NDArray[np.float64],
     gradient: NDArray[np.float64],
     index: NDArray[np.int64],
 ) -> None:
-    """Answer `ObstacleSet.near` in place; the arrays hold their padding and are at least one wide."""
+    """Answer `ObstacleSet.near` in place; the arrays hold their padding and are at least one wide.
+
+    So many points in a row as `together` says share a search, see :func:`_candidates`; it changes no answer.
+    """
     nodes = np.empty(STACK, dtype=np.int64)
+    solid = np.empty(CANDIDATES, dtype=np.int64)
+    from_centre = np.empty(CANDIDATES)
+    centre = np.empty(3)
+    found = np.empty((CANDIDATES, 4))
+    order = np.empty(CANDIDATES, dtype=np.int64)
+    row = solids.parameters
     shared = len(scene_start) == 2
     width = distance.shape[2]
     for r in range(points.shape[0]):
         scene = 0 if shared else r
-        for k in range(points.shape[1]):
-            px, py, pz = points[r, k]
-            keys = distance[r, k]
-            names = index[r, k]
-            vectors = gradient[r, k]
-            held = 0
-            reach = reaches[r, k]
-            depth = 0
-            if tree.root[scene] >= 0:
-                nodes[0] = tree.root[scene]
-                depth = 1
-            while depth > 0:
-                depth -= 1
-                node = nodes[depth]
-                bound = box_distance(tree.box, node, px, py, pz)
-                if bound >= reach or (held == width and bound > keys[0]):
-                    continue
-                if tree.right[node] >= 0:
-                    nodes[depth] = tree.right[node]
-                    nodes[depth + 1] = node + 1
-                    depth += 2
-                    continue
-                for entry in range(tree.first[node], tree.first[node] + tree.size[node]):
-                    i = tree.order[entry]
-                    d, gx, gy, gz = signed_distance(solids, i, px, py, pz)
+        for start in range(0, points.shape[1], together):
+            stop = min(start + together, points.shape[1])
+            count = -1
+            if together > 1:
+                ours, theirs = points[r, start:stop], reaches[r, start:stop]
+                count = _candidates(solids, tree, scene, ours, theirs, nodes, centre, solid, from_centre)
+            for k in range(start, stop if count >= 0 else start):
+                px, py, pz = points[r, k, 0], points[r, k, 1], points[r, k, 2]
+                reach = reaches[r, k]
+                away = length3(px - centre[0], py - centre[1], pz - centre[2]) + BOUND_M
+                held = 0
+                for c in range(count):
+                    if from_centre[c] - away >= reach:
+                        continue
+                    i = solid[c]
+                    if solids.kind[i] == SPHERE:
+                        d, gx, gy, gz = ball_distance(
+                            px - row[i, X], py - row[i, Y], pz - row[i, BASE], row[i, A]
+                        )
+                    else:
+                        d, gx, gy, gz = signed_distance(solids, i, px, py, pz)
                     if d >= reach:
                         continue
-                    name = i - scene_start[scene]
-                    if held < width:
-                        keys[held] = d
-                        names[held] = name
-                        _set(vectors, held, gx, gy, gz)
-                        held += 1
-                        _rise(keys, names, vectors, held - 1)
-                    elif d < keys[0] or (d == keys[0] and name < names[0]):
-                        keys[0] = d
-                        names[0] = name
-                        _set(vectors, 0, gx, gy, gz)
-                        _sink(keys, names, vectors, 0, held)
-            for last in range(held - 1, 0, -1):
-                _swap(keys, names, vectors, 0, last)
-                _sink(keys, names, vectors, 0, last)
+                    found[c, 0], found[c, 1], found[c, 2], found[c, 3] = d, gx, gy, gz
+                    at = held
+                    while at > 0 and (
+                        found[order[at - 1], 0] > d
+                        or (found[order[at - 1], 0] == d and solid[order[at - 1]] > i)
+                    ):
+                        at -= 1
+                    if at == width:
+                        continue
+                    held = min(held + 1, width)
+                    for later in range(held - 1, at, -1):
+                        order[later] = order[later - 1]
+                    order[at] = c
+                for n in range(held):
+                    c = order[n]
+                    distance[r, k, n] = found[c, 0]
+                    index[r, k, n] = solid[c] - scene_start[scene]
+                    for axis in range(3):
+                        gradient[r, k, n, axis] = found[c, 1 + axis]
+            for k in range(start if count < 0 else stop, stop):
+                px, py, pz = points[r, k]
+                keys = distance[r, k]
+                names = index[r, k]
+                vectors = gradient[r, k]
+                held = 0
+                reach = reaches[r, k]
+                depth = 0
+                if tree.root[scene] >= 0:
+                    nodes[0] = tree.root[scene]
+                    depth = 1
+                while depth > 0:
+                    depth -= 1
+                    node = nodes[depth]
+                    bound = box_distance(tree.box, node, px, py, pz)
+                    if bound >= reach or (held == width and bound > keys[0]):
+                        continue
+                    if tree.right[node] >= 0:
+                        nodes[depth] = tree.right[node]
+                        nodes[depth + 1] = node + 1
+                        depth += 2
+                        continue
+                    for entry in range(tree.first[node], tree.first[node] + tree.size[node]):
+                        i = tree.order[entry]
+                        d, gx, gy, gz = signed_distance(solids, i, px, py, pz)
+                        if d >= reach:
+                            continue
+                        name = i - scene_start[scene]
+                        if held < width:
+                            keys[held] = d
+                            names[held] = name
+                            _set(vectors, held, gx, gy, gz)
+                            held += 1
+                            _rise(keys, names, vectors, held - 1)
+                        elif d < keys[0] or (d == keys[0] and name < names[0]):
+                            keys[0] = d
+                            names[0] = name
+                            _set(vectors, 0, gx, gy, gz)
+                            _sink(keys, names, vectors, 0, held)
+                for last in range(held - 1, 0, -1):
+                    _swap(keys, names, vectors, 0, last)
+                    _sink(keys, names, vectors, 0, last)
+
+
+CANDIDATES = 64
+"""Obstacles near a row of points, at most, that are tested one by one at each of them."""
+BOUND_M = 1e-6
+"""What the bound on a distance is loosened by, so that rounding drops no obstacle [m]."""
+
+
+@compiled
+def _candidates(
+    solids: Solids,
+    tree: BoxTree,
+    scene: int,
+    points: NDArray[np.float64],
+    reaches: NDArray[np.float64],
+    nodes: NDArray[np.int64],
+    centre: NDArray[np.float64],
+    solid: NDArray[np.int64],
+    bound: NDArray[np.float64],
+) -> int:
+    """Obstacles that may be within reach of any of some points, or -1 if that are too many to be of use.
+
+    A signed distance changes by no more than the way gone, so that from the middle of the points one look
+    settles which obstacles can matter at all; `bound`, the distance there, says which of them can at a point.
+    """
+    lower, upper = np.inf * np.ones(3), -np.inf * np.ones(3)
+    reach = -np.inf
+    for k in range(points.shape[0]):
+        reach = max(reach, reaches[k])
+        for axis in range(3):
+            lower[axis] = min(lower[axis], points[k, axis])
+            upper[axis] = max(upper[axis], points[k, axis])
+    for axis in range(3):
+        centre[axis] = 0.5 * lower[axis] + 0.5 * upper[axis]
+    cx, cy, cz = centre[0], centre[1], centre[2]
+    widest = length3(upper[0] - cx, upper[1] - cy, upper[2] - cz)
+    # Very far out the coordinates themselves are coarser than the bound.
+    if not (abs(cx) + abs(cy) + abs(cz) + widest < 1e7):
+        return -1
+    reach += widest + BOUND_M
+    count = 0
+    depth = 0
+    if tree.root[scene] >= 0:
+        nodes[0] = tree.root[scene]
+        depth = 1
+    while depth > 0:
+        depth -= 1
+        node = nodes[depth]
+        if box_distance(tree.box, node, cx, cy, cz) >= reach:
+            continue
+        if tree.right[node] >= 0:
+            nodes[depth] = tree.right[node]
+            nodes[depth + 1] = node + 1
+            depth += 2
+            continue
+        for entry in range(tree.first[node], tree.first[node] + tree.size[node]):
+            i = tree.order[entry]
+            d = signed_distance(solids, i, cx, cy, cz)[0]
+            if d < reach:
+                if count == len(solid):
+                    return -1
+                solid[count] = i
+                bound[count] = d
+                count += 1
+    return count
 
 
 # A heap with the farthest (distance, index) at its top keeps the nearest few and ends as a sorted row, in

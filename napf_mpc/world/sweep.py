@@ -71,7 +71,12 @@ class SweptClearance:
         ValueError
             If a shape does not fit or a position of an active run is not finite.
         """
-        start, stop, flying = check_steps(p0, p1, active, self.clearance.shape)
+        self.take_in(*check_steps(p0, p1, active, self.clearance.shape))
+
+    def take_in(
+        self, start: NDArray[np.float64], stop: NDArray[np.float64], flying: NDArray[np.bool_]
+    ) -> None:
+        """Take in one step whose numbers :func:`check_steps` gave."""
         _update(
             self.obstacles.solids,
             self.obstacles.tree,
@@ -135,7 +140,7 @@ def swept_separation(p0: ArrayLike, p1: ArrayLike, active: ArrayLike | None = No
     """
     start, stop, flying = check_steps(p0, p1, active, np.shape(p0)[:2])
     separation = np.full(start.shape[:2], np.inf)
-    _separate(start, stop, flying, separation)
+    separate(start, stop, flying, separation)
     return separation
 
 
@@ -154,10 +159,23 @@ def check_steps(
             f"active has shape {flying.shape} and type {flying.dtype}, must be bool of shape {shape[:1]}"
         )
     for name, points in (("p0", start), ("p1", stop)):
-        bad = ~np.isfinite(points).all(axis=(1, 2)) & flying
-        if bad.any():
-            raise ValueError(f"{name} is not finite in run {int(np.argmax(bad))}; mask such runs with active")
+        bad = _first_not_finite(points, flying)
+        if bad >= 0:
+            raise ValueError(f"{name} is not finite in run {bad}; mask such runs with active")
     return start, stop, flying
+
+
+@compiled
+def _first_not_finite(points: NDArray[np.float64], flying: NDArray[np.bool_]) -> int:
+    """First flying run whose points (run, uav, 3) are not finite, or -1."""
+    for r in range(points.shape[0]):
+        if not flying[r]:
+            continue
+        for u in range(points.shape[1]):
+            for axis in range(3):
+                if not np.isfinite(points[r, u, axis]):
+                    return r
+    return -1
 
 
 @compiled
@@ -255,12 +273,13 @@ def _swept(
 
 
 @compiled
-def _separate(
+def separate(
     start: NDArray[np.float64],
     stop: NDArray[np.float64],
     flying: NDArray[np.bool_],
     separation: NDArray[np.float64],
 ) -> None:
+    """Lower running minima (run, uav) of :func:`swept_separation` by a step that :func:`check_steps` gave."""
     for r in range(start.shape[0]):
         if not flying[r]:
             continue
