@@ -40,6 +40,8 @@ times that leaves room for other weights, and is still an order below what spoil
 """
 CONTACT_W2 = 100.0
 """Quadratic price of a contact slack [1/(m^2 s)]: spreads what cannot be met over the stages."""
+NEWTON_STEPS = 6
+"""Steps to the last digit from where :func:`distance_of_force` starts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +116,16 @@ class Gaps:
     def rows_beyond(self, position: Array, distance: Array | float) -> tuple[Array, Array]:
         """Coefficients and lower bounds of rows "shifted distance >= distance" on the position."""
         return self.normal, along_rows(self.normal, position) + (distance - self.shifted)
+
+    def opening(self, horizon: Horizon, distance_m: float, speed_mps: float) -> Array:
+        """Shifted distances (run, uav, N, M) to ask for, where one that is short now opens at a speed [m].
+
+        Now is the plan's first node, seen along each row's own normal.
+        """
+        first = along_rows(self.normal, horizon.position[:, :, :1])
+        here = self.shifted + (first - along_rows(self.normal, horizon.position))
+        opened = speed_mps * np.cumsum(horizon.step_s)[:, None]
+        return np.asarray(np.minimum(distance_m, np.minimum(distance_m, here) + opened))
 
 
 @compiled
@@ -285,19 +297,37 @@ class ObstacleContact(_Shell):
 
     extra_m: float = 0.0
     """Distance kept on top of the margin [m]."""
+    opening_mps: float | None = None
+    """A UAV that is inside a margin now is asked to leave it at this speed, not at once: a sigma that jumps by
+    tens of metres must not make it lunge. None asks at once [m/s]."""
     w1: float = CONTACT_W1
     """Linear price of the slack [1/(m s)]."""
     w2: float = CONTACT_W2
     """Quadratic price of the slack [1/(m^2 s)]."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.opening_mps is not None and not self.opening_mps > 0.0:
+            raise ConstraintError(f"opening_mps = {self.opening_mps!r}, must be > 0, or None")
 
     @property
     def name(self) -> str:
         """Name in results and errors."""
         return "obstacle contact"
 
+    def shortfall(self, horizon: Horizon, position: Array) -> Array:
+        """Most that plans (run, uav, N, 3) are inside the margin of an obstacle of their rows [m]."""
+        gaps = self.gaps(horizon, self.extra_m)
+        moved = along_rows(gaps.normal, position) - along_rows(gaps.normal, horizon.position)
+        return np.asarray(np.maximum(self.extra_m - (gaps.shifted + moved), 0.0).max(axis=(2, 3)))
+
     def rows(self, horizon: Horizon) -> LinearRows:
         """Rows ``n^T p >= n^T p_lin - rho_bar(p_lin) + extra - s`` [m]."""
-        jac, lower = self.gaps(horizon, self.extra_m).rows_beyond(horizon.position, self.extra_m)
+        gaps = self.gaps(horizon, self.extra_m)
+        asked: Array | float = self.extra_m
+        if self.opening_mps is not None:
+            asked = gaps.opening(horizon, self.extra_m, self.opening_mps)
+        jac, lower = gaps.rows_beyond(horizon.position, asked)
         slack = (*horizon.shape, 1)
         return LinearRows(
             "position", jac, lower, None, np.full(slack, self.w1), np.full(slack, self.w2), shared_slack=True
@@ -319,9 +349,14 @@ class ObstacleInfluence(_Shell):
 
     per_speed: float = 1.0
     """Unit factor c: price per metre and second for each m/s of NAPF's velocity [1/(m s) per m/s]."""
+    most: float = math.inf
+    """Pull of a row at most [1/(m s)]: nearer than where NAPF pulls as much, it is held. Without a bound, a
+    force law for wide scenes outbids the limits of speed and tilt deep inside a margin."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.most > 0.0:
+            raise ConstraintError(f"most = {self.most!r}, must be > 0")
         if not (math.isfinite(self.per_speed) and self.per_speed > 0.0):
             raise ConstraintError(f"per_speed = {self.per_speed!r}, must be > 0")
 
@@ -334,9 +369,11 @@ class ObstacleInfluence(_Shell):
         """Rows ``n^T p >= n^T p_lin + rho_t - rho_bar(p_lin) - s`` [m], each with a slack of its own."""
         settings = horizon.problem.planner
         gaps = self.gaps(horizon, settings.influence_m)
-        weight, target = influence_model(
-            gaps.shifted, settings.repulsive_gain, gaps.influence, settings.min_distance_m
-        )
+        floor: Array | float = settings.min_distance_m
+        if math.isfinite(self.most) and settings.repulsive_gain > 0.0:
+            ratio = self.most / (self.per_speed * settings.repulsive_gain)
+            floor = np.maximum(floor, distance_of_force(ratio, gaps.influence))
+        weight, target = influence_model(gaps.shifted, settings.repulsive_gain, gaps.influence, floor)
         jac, lower = gaps.rows_beyond(horizon.position, target)
         w2 = self.per_speed * weight
         free = w2 <= 0.0
@@ -351,8 +388,26 @@ class ObstacleInfluence(_Shell):
         )
 
 
+def distance_of_force(ratio: float, influence_m: Array) -> Array:
+    """Distance rho at which Eq. 28 over its gain, ``(1/rho - 1/rho_0) / rho^2``, has a value [m].
+
+    Parameters
+    ----------
+    ratio : float
+        Force over gain, >= 0 [1/m^3].
+    influence_m : array, shape (...)
+        rho_0 [m].
+    """
+    slope = 1.0 / influence_m
+    # x^2 (x - 1/rho_0) of x = 1/rho is convex and rising beyond 1/rho_0: Newton's steps from above stay there.
+    x = slope + ratio ** (1.0 / 3.0)
+    for _ in range(NEWTON_STEPS):
+        x -= (x * x * (x - slope) - ratio) / (x * (3.0 * x - 2.0 * slope))
+    return np.asarray(1.0 / x)
+
+
 def influence_model(
-    rho: Array, gain: float, influence_m: Array | float, floor_m: float
+    rho: Array, gain: float, influence_m: Array | float, floor_m: Array | float
 ) -> tuple[Array, Array]:
     """Second-order model of the repulsive potential: stiffness, and the distance at which it is at rest.
 
@@ -364,7 +419,7 @@ def influence_model(
         k_r.
     influence_m : array or float, shape (...)
         rho_0 [m].
-    floor_m : float
+    floor_m : array or float, shape (...)
         Least distance [m].
 
     Returns

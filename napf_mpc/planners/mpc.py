@@ -28,7 +28,7 @@ from napf_mpc.planners.tally import COUNTED, FALL_BACKS, Tally
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem import Planner as Settings
 from napf_mpc.qp import STATES, HorizonQp
-from napf_mpc.safety_distance import Inflation, rms_sigma
+from napf_mpc.safety_distance import Inflation, directional_sigma
 from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
 from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
@@ -44,6 +44,10 @@ UPSET_RAD = 1.0
 """Roll or pitch beyond which the model about hover is worth nothing: the inner loop levels the UAV first."""
 SLOT_PART, OPENING_MPS = 0.7, 1.0
 """What is asked of neighbours at most: this part of the distance of their slots, and no faster parting."""
+REPULSION_PART = 0.5
+"""NAPF's repulsion pulls with this part of the contact price at most: it never outbids the margin itself."""
+LEAVING_MPS = 2.0
+"""A UAV inside a margin is asked to leave it no faster than this."""
 SPEED_PRICE = (1000.0, 1000.0)
 """Prices of a speed slack: above what the margins can gain by it, so that no margin buys a dash."""
 _CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
@@ -54,8 +58,10 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     """Rows of the QP as a problem's settings ask for them."""
     settings = problem.planner
     rows, price = settings.obstacle_rows, settings.contact_price
-    contact = ObstacleContact(obstacles=rows, w1=price, extra_m=settings.contact_extra_m)
-    influence = ObstacleInfluence(obstacles=rows, per_speed=settings.influence_scale)
+    contact = ObstacleContact(
+        obstacles=rows, w1=price, extra_m=settings.contact_extra_m, opening_mps=LEAVING_MPS
+    )
+    influence = ObstacleInfluence(obstacles=rows, per_speed=settings.influence_scale, most=REPULSION_PART * price)
     neighbours = min(NEIGHBOURS, problem.uav_count - 1)
     apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
     others: list[Constraint] = [apart] if neighbours else []
@@ -148,6 +154,7 @@ class QpPlanner:
         self._plan: Plan | None = None
         self._answer: BatchResult | None = None
         self._tracks: Tracks | None = None
+        self._last_horizon: Horizon | None = None
         self._made_s: Array = np.full((runs, uavs), -np.inf)
         self._anchor: Array = np.repeat(self._lanes[None], runs, axis=0)
         if self._guidance is not None:
@@ -159,7 +166,7 @@ class QpPlanner:
         """Programs of this step, in coordinates whose origin is each UAV's reported position."""
         trusted = nav.trusted()
         state = self._state(nav, trusted)
-        reference = self._slots.over(state[..., POSITION], self._model.times_s, _sigma(nav, trusted))
+        reference = self._slots.over(state[..., POSITION], self._model.times_s, self._sigma(nav, trusted))
         guess, _ = self._guess(state, reference, time_s)
         return self._programs(state, reference, self._horizon(guess, nav, trusted, time_s))
 
@@ -174,7 +181,7 @@ class QpPlanner:
         guide = None
         if self._guidance is not None:
             guide = self._guidance.step(state[..., POSITION], covariance, trusted, time_s)
-        reference = self._slots.over(state[..., POSITION], self._model.times_s, _sigma(nav, trusted), guide)
+        reference = self._slots.over(state[..., POSITION], self._model.times_s, self._sigma(nav, trusted), guide)
         began = 0.0 if self._clock is None else self._clock()
         answer = self._solve(state, reference, nav, trusted, time_s)
         late = self._clock is not None and not self._clock() - began <= self._period_s
@@ -188,7 +195,7 @@ class QpPlanner:
         causes = np.where(trusted, causes, np.where(airborne, "navigation", ""))
         flown, action = self._choose(time_s, state, answer, accepted, trusted & ~upset, causes)
         self._plan, self._answer = flown, answer
-        slack = self._contact_slack(answer, accepted)
+        slack = self._contact_slack(answer, flown, accepted)
         self._count(answer, slack, action, accepted, trusted, airborne)
         self._count_short_margins(nav, trusted)
         on_plan = action <= Action.TAIL
@@ -210,6 +217,14 @@ class QpPlanner:
             slack_m=slack,
             solver_status=_WORDS[answer.status],
         )
+
+    def _sigma(self, nav: NavSolution, trusted: Mask) -> Array:
+        """Standard deviations (run, uav, 3) of position measurements along, left and up; 0 of estimates [m]."""
+        if nav.filtered:
+            return np.zeros((*trusted.shape, 3))
+        covariance = np.where(trusted[..., None, None], nav.position_covariance, 0.0)
+        axes = [directional_sigma(covariance, axis) for axis in self._frame.axes]
+        return np.stack(axes, axis=-1)
 
     def _state(self, nav: NavSolution, trusted: Mask) -> Array:
         """State (run, uav, 12) as reported; a UAV that is not trusted stands at its last known place."""
@@ -274,7 +289,8 @@ class QpPlanner:
                 better = np.asarray(np.isfinite(answer.states).all(axis=(2, 3), keepdims=True))
                 states = np.where(better, _moved(answer.states, origin), states)
                 inputs = np.where(better, answer.inputs, inputs)
-            programs = self._programs(state, reference, self._horizon(states, nav, trusted, time_s))
+            self._last_horizon = self._horizon(states, nav, trusted, time_s)
+            programs = self._programs(state, reference, self._last_horizon)
             warm = None if answer is None else answer.warm_start(_moved(states, -origin), inputs)
             answer = self._answer_to(programs, warm, asked)
         assert answer is not None
@@ -345,11 +361,15 @@ class QpPlanner:
                 tally.add(f"fall_back_{name}", airborne & (action == rung))
         np.fmax(tally.largest_slack_m, np.fmax.reduce(slack, axis=-1), out=tally.largest_slack_m)
 
-    def _contact_slack(self, answer: BatchResult, accepted: Mask) -> Array:
+    def _contact_slack(self, answer: BatchResult, flown: Plan, accepted: Mask) -> Array:
         """Most that each new plan (run, uav) is inside an obstacle's margin, NaN without one [m]."""
         most = np.full(accepted.shape, np.nan)
         for constraint, slack in zip(self.constraints, answer.slacks, strict=True):
-            if isinstance(constraint, ObstacleContact | MovingObstacleContact):
+            if isinstance(constraint, ObstacleContact) and self._last_horizon is not None:
+                # Not the slack: a row may ask for less than the margin, see its opening speed.
+                place = np.ascontiguousarray(flown.states[..., POSITION])
+                most = np.fmax(most, constraint.shortfall(self._last_horizon, place))
+            elif isinstance(constraint, MovingObstacleContact):
                 most = np.fmax(most, slack.max(axis=(2, 3), initial=0.0))
         return np.where(accepted, most, np.nan)
 
@@ -365,12 +385,6 @@ class QpPlanner:
 def _reasons(action: Codes, trusted: Mask) -> Codes:
     waiting = action > Action.TAIL
     return np.where(waiting, np.where(trusted, Reason.SOLVER, Reason.NAVIGATION), Reason.NONE).astype(np.int8)
-
-
-def _sigma(nav: NavSolution, trusted: Mask) -> Array:
-    if nav.filtered:
-        return np.zeros(trusted.shape)
-    return rms_sigma(np.where(trusted[..., None, None], nav.position_covariance, 0.0))
 
 
 def _moved(states: Array, by: Array) -> Array:

@@ -51,17 +51,18 @@ class SlotReference:
             As reported [m].
         times_s : array, shape (N,)
             From now [s].
-        sigma_m : array, shape (run, uav)
-            Reported standard deviation of the position [m]. A distance e to the slot is believed, and so
-            asked for, by the part ``e^2 / (e^2 + sigma^2)``: below sigma it is mostly navigation error, and
-            chasing that would move the truth off the slot.
+        sigma_m : array, shape (run, uav, 3), or float
+            Standard deviation of position *measurements* along, left and up [m]. A distance e to the slot is
+            believed, and so asked for, by the part ``e^2 / (e^2 + sigma^2)`` of each axis: below sigma it is
+            mostly navigation error, and chasing that would move the truth off the slot. The error of a
+            filter's estimate does not depend on the estimate: there it is 0, and all is asked for.
         guide : Guide, optional
             Offsets from the lanes, and pace.
         """
         place = self.frame.to_path(position)
         ahead = synchronisation_error(place[..., 0], self.offsets[:, 0])
-        sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), ahead.shape)
-        behind = _believed(ahead, sigma) * np.clip(-ahead, -LARGEST_PULL_M, LARGEST_PULL_M)
+        sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), place.shape)
+        behind = _believed(ahead, sigma[..., 0]) * np.clip(-ahead, -LARGEST_PULL_M, LARGEST_PULL_M)
         out = np.zeros((*ahead.shape, len(times_s), STATES))
         _write(
             plain(position), place, plain(self.offsets), plain(sigma), behind, self.speed_mps,
@@ -89,8 +90,10 @@ def _write(
         In the world and on the path [m].
     slots : array, shape (uav, 3)
         From the formation's centre [m].
-    sigma_m, behind, pace : array, shape (run, uav)
-        Of the position [m], how far the slot is ahead of it, as far as believed [m], factor on the speed.
+    sigma_m : array, shape (run, uav, 3)
+        Of measurements along, left and up [m].
+    behind, pace : array, shape (run, uav)
+        How far the slot is ahead, as far as believed [m], and the factor on the speed.
     ahead_m, bend : array, shapes (K,) and (run, uav, K, 2), or without entries
         A guide's distances, and offsets there [m].
     axes : array, shape (3, 3)
@@ -105,11 +108,10 @@ def _write(
             for a in range(2):
                 across[a] = slots[uav, 1 + a] + here[a] - place[run, uav, 1 + a]
             size = math.sqrt(across[0] * across[0] + across[1] * across[1])
-            square, noise = size * size, sigma_m[run, uav] * sigma_m[run, uav]
-            believed = square / max(square + noise, 1e-12)
-            pull = believed * LARGEST_PULL_M / max(size, LARGEST_PULL_M)
             for a in range(2):
-                start[a] = across[a] * pull - here[a]
+                square, noise = across[a] * across[a], sigma_m[run, uav, 1 + a] * sigma_m[run, uav, 1 + a]
+                believed = square / max(square + noise, 1e-12)
+                start[a] = across[a] * believed * LARGEST_PULL_M / max(size, LARGEST_PULL_M) - here[a]
             speed = speed_mps * pace[run, uav]
             for n in range(len(times_s)):
                 along = behind[run, uav] + speed * times_s[n]
