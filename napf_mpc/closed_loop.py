@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets
+from napf_mpc.jit import compiled
 from napf_mpc.navigation.error_models import Fix, PositionErrors, position_errors
 from napf_mpc.navigation.filtered import FilteredNavigation
 from napf_mpc.navigation.solution import NavSolution
@@ -25,7 +26,7 @@ from napf_mpc.navigation.tracks import MovingTracker
 from napf_mpc.planners.planner import Command, Planner
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.vehicle.lqr import check_sampled_loop
-from napf_mpc.vehicle.plant import advance
+from napf_mpc.vehicle.plant import advance, plain
 from napf_mpc.vehicle.quadrotor import parameters
 from napf_mpc.vehicle.tracking import TrackingLaw, tracking_law
 from napf_mpc.world.moving import MovingObstacles, moving_obstacles
@@ -179,7 +180,7 @@ def closed_loop(
     runs = len(scenario.runs)
 
     active = np.ones(runs, dtype=bool)
-    failed = np.zeros(runs, dtype=bool)
+    failed, lost = np.zeros(runs, dtype=bool), np.zeros(runs, dtype=bool)
     holding = np.zeros(runs, dtype=bool)
     reason = np.zeros(runs, dtype=np.int8)
     finish_time = np.full(runs, np.nan)
@@ -222,9 +223,7 @@ def closed_loop(
         for step in range(clock.steps_per_tick):
             before = state.copy()
             advance(state, inputs, constants, clock.step_s, 1, active)
-            lost = active & ~(np.abs(state[..., POSITION]) < LOST_M).all((-1, -2))
-            lost |= active & ~np.isfinite(state).all((-1, -2))
-            if lost.any():
+            if _lost(state, active, lost):
                 failed |= lost
                 active = active & ~lost
                 duration[lost] = time_s
@@ -324,18 +323,67 @@ def _inner_loop(law: TrackingLaw, nav: NavSolution, command: Command, active: Ma
     position, velocity, direction = command.position, command.velocity, command.direction
     attitude, rates, feedforward = nav.attitude, nav.body_rates, command.feedforward
     if command.plan is not None and command.planned is not None:
-        # u = u_plan(t) - K (x_nav - x_plan(t)): the law counts attitude and rates from level flight at the
-        # reference yaw, so it is shown their difference to the plan's.
-        planned = command.planned[..., None]
-        state, held = command.plan.at(nav.time_s)
-        position = np.where(planned, state[..., POSITION], position)
-        velocity = np.where(planned, state[..., VELOCITY], velocity)
-        direction = np.where(planned, 0.0, direction)
-        lean = state[..., ATTITUDE] - command.yaw[..., None] * np.array([0.0, 0.0, 1.0])
-        attitude = attitude - np.where(planned, lean, 0.0)
-        rates = rates - np.where(planned, state[..., RATES], 0.0)
-        feedforward = np.where(planned, held, feedforward)
+        vectors = (position, velocity, direction, attitude, rates)
+        shown = np.empty((len(vectors), *nav.position.shape))
+        for n, values in enumerate(vectors):
+            shown[n] = values
+        position, velocity, direction, attitude, rates = shown
+        feedforward = np.array(feedforward, dtype=np.float64, order="C")
+        planned, held = command.plan.at(nav.time_s)
+        _show_plan(command.planned, plain(planned), plain(held), plain(command.yaw), shown, feedforward)
     return law.inputs(
         nav.position, nav.velocity, attitude, rates, position, velocity, direction, command.yaw, feedforward,
         active,
     )  # fmt: skip
+
+
+@compiled
+def _show_plan(
+    follows: Mask, planned: Array, held: Array, yaw: Array, shown: Array, feedforward: Array
+) -> None:
+    """Give the law what makes it fly ``u = u_plan(t) - K (x_nav - x_plan(t))``, where a plan is followed.
+
+    The law counts attitude and rates from level flight at the reference yaw, so it is shown their difference
+    to the plan's.
+
+    Parameters
+    ----------
+    follows : array of bool, shape (run, uav)
+        Who follows a plan.
+    planned, held : array, shapes (run, uav, 12) and (run, uav, 4)
+        State and input about hover of the plans now.
+    yaw : array, shape (run, uav)
+        Reference [rad].
+    shown, feedforward : array, shapes (5, run, uav, 3) and (run, uav, 4)
+        Position, velocity and direction to fly, attitude and rates as reported; overwritten.
+    """
+    for run in range(follows.shape[0]):
+        for uav in range(follows.shape[1]):
+            if not follows[run, uav]:
+                continue
+            x = planned[run, uav]
+            for a in range(3):
+                shown[0, run, uav, a] = x[2 * a]
+                shown[1, run, uav, a] = x[2 * a + 1]
+                shown[2, run, uav, a] = 0.0
+                shown[3, run, uav, a] -= x[6 + 2 * a] - yaw[run, uav] * (1.0 if a == 2 else 0.0)
+                shown[4, run, uav, a] -= x[7 + 2 * a]
+            for i in range(4):
+                feedforward[run, uav, i] = held[run, uav, i]
+
+
+@compiled
+def _lost(state: Array, active: Mask, lost: Mask) -> bool:
+    """Write which active runs hold a number that is not finite, or a UAV too far out; whether any does."""
+    some = False
+    for run in range(state.shape[0]):
+        lost[run] = False
+        if not active[run]:
+            continue
+        for uav in range(state.shape[1]):
+            for i in range(state.shape[2]):
+                size = abs(state[run, uav, i])
+                # What is not a number fails every comparison.
+                if not size < np.inf or (i % 2 == 0 and i < 6 and not size < LOST_M):
+                    lost[run] = some = True
+    return some

@@ -103,7 +103,10 @@ class MissionScore:
         self._problem = problem
         self._scenario = scenario
         self._frame = PathFrame.of_mission(mission)
+        self._axes = self._frame.axes
         self._offsets = formation_offsets(problem.formation)
+        self._hover_thrust = float(hover_input(problem.vehicle)[0])
+        self._reform_bound_m = mission.reform_bound_m
         runs, uavs = scenario.initial_state.shape[:2]
         self._clearance = SweptClearance(scenario.obstacles, runs, uavs)
         moving = scenario.moving
@@ -149,10 +152,7 @@ class MissionScore:
         if time_s > APART_S and p0.shape[1] > 1:
             nearest = swept_separation(p0, p1)
             np.minimum(self._separation, nearest, out=self._separation, where=active[:, None])
-        step = p1 - p0
-        length = np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2 + step[..., 2] ** 2)
-        self._flown += np.where(active[:, None], length, 0.0)
-        self._end = np.where(active[:, None], self._frame.along_track(p1), self._end)
+        _travel(p0, p1, active, self._frame.origin, self._frame.along, self._flown, self._end)
 
     def ticked(
         self, time_s: float, state: Array, nav: NavSolution, command: Command, inputs: Array, active: Mask
@@ -168,10 +168,10 @@ class MissionScore:
             inputs,
             active,
             self._frame.origin,
-            self._frame.axes,
+            self._axes,
             self._offsets,
-            float(hover_input(self._problem.vehicle)[0]),
-            formation_mission(self._problem).reform_bound_m,
+            self._hover_thrust,
+            self._reform_bound_m,
             self._last_obstacle,
             self._sums,
             self._below_since,
@@ -281,6 +281,21 @@ def _finite_or_nan(values: Array) -> Array:
 
 
 _COUNT, _PATH, _SHAPE, _FLOOR, _EFFORT, _FIXES, _WITHIN = 0, 1, 2, 3, 4, 5, 6
+
+
+@compiled
+def _travel(
+    p0: Array, p1: Array, active: Mask, origin: Array, along: Array, flown: Array, end: Array
+) -> None:
+    """Add the way from p0 to p1 (run, uav, 3) to ``flown``, and write the along-track places of its ends."""
+    for r in range(p0.shape[0]):
+        if not active[r]:
+            continue
+        for i in range(p0.shape[1]):
+            x, y, z = p1[r, i, 0] - p0[r, i, 0], p1[r, i, 1] - p0[r, i, 1], p1[r, i, 2] - p0[r, i, 2]
+            flown[r, i] += math.sqrt(x * x + y * y + z * z)
+            u, v, w = p1[r, i, 0] - origin[0], p1[r, i, 1] - origin[1], p1[r, i, 2] - origin[2]
+            end[r, i] = u * along[0] + v * along[1] + w * along[2]
 
 
 @compiled

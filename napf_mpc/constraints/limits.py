@@ -9,7 +9,9 @@ the row; the quadratic part spreads what cannot be met.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,6 +48,23 @@ def _everywhere(horizon: Horizon, values: Array) -> Array:
     return np.array(np.broadcast_to(values, (*horizon.shape, *values.shape)))
 
 
+class _Steady:
+    """Rows that are the same every step: made once, and again when what they follow from is another."""
+
+    def __init__(self) -> None:
+        self._made: tuple[Hashable, LinearRows] | None = None
+
+    def rows(self, follow_from: Hashable, make: Callable[[], LinearRows]) -> LinearRows:
+        """Rows as they were made from the same; nobody may write into them."""
+        if self._made is None or self._made[0] != follow_from:
+            self._made = follow_from, make()
+        return self._made[1]
+
+
+def _steady() -> Any:
+    return field(default_factory=_Steady, init=False, repr=False, compare=False)
+
+
 def _positive(**values: float | None) -> None:
     for name, value in values.items():
         if value is not None and not (math.isfinite(value) and value > 0.0):
@@ -69,6 +88,7 @@ class SpeedLimit:
     """Linear price of a slack [1/(m/s s)]."""
     w2: float = SPEED_W2
     """Quadratic price of a slack [1/((m/s)^2 s)]."""
+    _kept: _Steady = _steady()
 
     def __post_init__(self) -> None:
         _positive(max_mps=self.max_mps, max_climb_mps=self.max_climb_mps)
@@ -84,8 +104,14 @@ class SpeedLimit:
         """Rows ``|d_i^T v| <= v_max cos(pi / 2n)`` of n directions and ``|v_z| <= climb`` [m/s]."""
         most = self.max_mps if self.max_mps is not None else _mission_speed(horizon)
         climb = most if self.max_climb_mps is None else self.max_climb_mps
+        heading = horizon.frame.heading_rad
+        return self._kept.rows(
+            (horizon.shape, most, heading), lambda: self._rows(horizon, most, climb, heading)
+        )
+
+    def _rows(self, horizon: Horizon, most: float, climb: float, heading_rad: float) -> LinearRows:
         n = self.directions
-        angle = horizon.frame.heading_rad + (np.arange(n) + 0.5) * math.pi / n
+        angle = heading_rad + (np.arange(n) + 0.5) * math.pi / n
         flat = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)])
         jac = np.vstack([flat, [0.0, 0.0, 1.0]])
         bound = _everywhere(horizon, np.array([most * math.cos(0.5 * math.pi / n)] * n + [climb]))
@@ -110,6 +136,7 @@ class TiltLimit:
     """Linear price of a slack [1/(rad s)]."""
     w2: float = TILT_W2
     """Quadratic price of a slack [1/(rad^2 s)]."""
+    _kept: _Steady = _steady()
 
     def __post_init__(self) -> None:
         _positive(max_rad=self.max_rad)
@@ -121,6 +148,9 @@ class TiltLimit:
 
     def rows(self, horizon: Horizon) -> LinearRows:
         """Rows ``|roll| <= max`` and ``|pitch| <= max`` [rad]."""
+        return self._kept.rows(horizon.shape, lambda: self._rows(horizon))
+
+    def _rows(self, horizon: Horizon) -> LinearRows:
         bound = np.full((*horizon.shape, 2), self.max_rad)
         jac = _everywhere(horizon, np.eye(3)[:2])
         return LinearRows("attitude", jac, -bound, bound, *_soft(horizon, 2, self.w1, self.w2))
@@ -286,6 +316,7 @@ class InputBox:
     """Largest angular acceleration in roll and pitch [rad/s^2]."""
     yaw_radps2: float = 5.0
     """Largest angular acceleration in yaw [rad/s^2]."""
+    _kept: _Steady = _steady()
 
     def __post_init__(self) -> None:
         _positive(turn_radps2=self.turn_radps2, yaw_radps2=self.yaw_radps2)
@@ -318,7 +349,11 @@ class InputBox:
 
     def rows(self, horizon: Horizon) -> LinearRows:
         """Rows ``lower <= u <= upper`` of the four inputs about hover [N, N m]."""
-        lower, upper = self.bounds(horizon.problem.vehicle)
+        vehicle = horizon.problem.vehicle
+        return self._kept.rows((horizon.shape, vehicle), lambda: self._rows(horizon, vehicle))
+
+    def _rows(self, horizon: Horizon, vehicle: Vehicle) -> LinearRows:
+        lower, upper = self.bounds(vehicle)
         return LinearRows(
             "input",
             _everywhere(horizon, np.eye(4)),

@@ -376,7 +376,13 @@ def margin_attainable(
     kept = np.empty((math.prod(lead), uavs, uavs), dtype=np.bool_)
     factor = common_factor.reshape(len(kept), *common_factor.shape[-3:])
     _keeps(
-        plain(covariance.reshape(len(kept), uavs, 3, 3)), _cross(factor), inflation.k, normal, room, reach, kept
+        plain(covariance.reshape(len(kept), uavs, 3, 3)),
+        _cross(factor),
+        inflation.k,
+        normal,
+        room,
+        reach,
+        kept,
     )
     return kept.reshape(*lead, uavs, uavs)
 

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.jit import compiled
 from napf_mpc.navigation.tracks import Tracks
+from napf_mpc.vehicle.plant import plain
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -63,22 +66,40 @@ class NavSolution:
         A variance of zero, a negative one or NaN means "unknown", never "certain", and so does a matrix with
         a negative eigenvalue: such a solution is not to be planned with.
         """
-        finite = np.isfinite(self.position).all(-1) & np.isfinite(self.velocity).all(-1)
-        finite &= np.isfinite(self.attitude).all(-1) & np.isfinite(self.body_rates).all(-1)
-        finite &= np.isfinite(self.covariance).all((-1, -2))
-        variances = np.einsum("...ii->...i", self.position_covariance)
-        sound = (variances > 0.0).all(-1) & _semidefinite(self.position_covariance)
-        return np.asarray(self.available & finite & sound)
+        trusted = np.empty(self.available.shape, dtype=np.bool_)
+        _sound(
+            plain(self.position), plain(self.velocity), plain(self.attitude), plain(self.body_rates),
+            plain(self.covariance), trusted,
+        )  # fmt: skip
+        return np.asarray(self.available & trusted)
 
 
-def _semidefinite(c: Array) -> NDArray[np.bool_]:
-    """Whether 3x3 matrices (..., 3, 3) have no negative eigenvalue beyond rounding, by their minors."""
-    xy, xz, yz = (0.5 * (c[..., i, j] + c[..., j, i]) for i, j in ((0, 1), (0, 2), (1, 2)))
-    x, y, z = c[..., 0, 0], c[..., 1, 1], c[..., 2, 2]
+@compiled
+def _sound(
+    position: Array, velocity: Array, attitude: Array, rates: Array, covariance: Array, sound: Mask
+) -> None:
+    """Write whether all numbers of a solution are finite and its position's covariance is one."""
+    for run in range(sound.shape[0]):
+        for uav in range(sound.shape[1]):
+            fine = _semidefinite(covariance[run, uav])
+            for a in range(3):
+                fine = fine and np.isfinite(position[run, uav, a]) and np.isfinite(velocity[run, uav, a])
+                fine = fine and np.isfinite(attitude[run, uav, a]) and np.isfinite(rates[run, uav, a])
+                fine = fine and covariance[run, uav, a, a] > 0.0
+            for a in range(6):
+                for b in range(6):
+                    fine = fine and np.isfinite(covariance[run, uav, a, b])
+            sound[run, uav] = fine
+
+
+@compiled
+def _semidefinite(c: Array) -> bool:
+    """Whether the leading 3x3 of a matrix has no negative eigenvalue beyond rounding, by its minors."""
+    xy, xz, yz = 0.5 * (c[0, 1] + c[1, 0]), 0.5 * (c[0, 2] + c[2, 0]), 0.5 * (c[1, 2] + c[2, 1])
+    x, y, z = c[0, 0], c[1, 1], c[2, 2]
     # Each minor is measured against the product of its variances, whatever their unit's size.
-    with np.errstate(invalid="ignore", over="ignore"):
-        slack = 1e-9
-        sound = xy * xy <= x * y * (1.0 + slack)
-        sound &= (xz * xz <= x * z * (1.0 + slack)) & (yz * yz <= y * z * (1.0 + slack))
-        determinant = x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz)
-        return np.asarray(sound & (determinant >= -slack * x * y * z))
+    slack = 1e-9
+    sound = xy * xy <= x * y * (1.0 + slack)
+    sound = sound and xz * xz <= x * z * (1.0 + slack) and yz * yz <= y * z * (1.0 + slack)
+    determinant = x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz)
+    return bool(sound and determinant >= -slack * x * y * z)

@@ -187,7 +187,8 @@ class QpPlanner:
         causes = np.where(trusted, causes, np.where(airborne, "navigation", ""))
         flown, action = self._choose(time_s, state, answer, accepted, trusted & ~upset, causes)
         self._plan, self._answer = flown, answer
-        self._count(answer, action, accepted, trusted, airborne)
+        slack = self._contact_slack(answer, accepted)
+        self._count(answer, slack, action, accepted, trusted, airborne)
         self._count_short_margins(nav, trusted)
         on_plan = action <= Action.TAIL
         down = np.where(action == Action.DESCEND, -DESCENT_MPS, 0.0)[..., None] * self._frame.up
@@ -205,7 +206,7 @@ class QpPlanner:
             plan=flown,
             planned=on_plan,
             reason=reason,
-            slack_m=self._contact_slack(answer, accepted),
+            slack_m=slack,
             solver_status=_WORDS[answer.status],
         )
 
@@ -235,8 +236,8 @@ class QpPlanner:
         return Horizon(
             time_s=time_s,
             step_s=self._model.step_s,
-            position=guess[..., POSITION],
-            velocity=guess[..., VELOCITY],
+            position=np.ascontiguousarray(guess[..., POSITION]),
+            velocity=np.ascontiguousarray(guess[..., VELOCITY]),
             covariance=np.repeat(covariance[:, :, None], self._model.stages, axis=2),
             common_factor=np.where(known, nav.common_factor, 0.0),
             obstacles=self._obstacles,
@@ -295,7 +296,6 @@ class QpPlanner:
     ) -> tuple[Plan, Codes]:
         """Plans that fly from now on, and by which rung of the ladder."""
         old, step_s = self._plan, self._model.step_s
-        still = standing_plan(self.problem.vehicle, self._yaw, time_s, step_s, self._anchor)
         new = Plan(
             self.problem.vehicle, self._yaw, time_s, step_s, state,
             _moved(answer.states, state[:, :, None, POSITION]), answer.inputs,
@@ -304,9 +304,12 @@ class QpPlanner:
             self._made_s[:] = time_s
             no_need = np.zeros(accepted.shape, dtype=bool)
             return new, self.ladder.decide(time_s, accepted, self._made_s, no_need, causes)
-        tail = still if old is None else old.resumed(time_s, step_s)
+        still = standing_plan(self.problem.vehicle, self._yaw, time_s, step_s, self._anchor)
         # Without navigation nothing tells whether the tail is followed; upset, it cannot be.
-        clear = sound & (self._clearance(tail) >= 0.0)
+        clear, tail = sound & ~accepted, still
+        if clear.any():
+            tail = still if old is None else old.resumed(time_s, step_s)
+            clear &= self._clearance(tail) >= 0.0
         action = self.ladder.decide(time_s, accepted, time_s - self._made_s, clear, causes)
         self._made_s = np.where(accepted, time_s, self._made_s)
         return new.where(accepted, tail.where(action == Action.TAIL, still)), action
@@ -323,17 +326,19 @@ class QpPlanner:
         return np.asarray(least - self.problem.vehicle.radius_m)
 
     def _count(
-        self, answer: BatchResult, action: Codes, accepted: Mask, trusted: Mask, airborne: Mask
+        self, answer: BatchResult, slack: Array, action: Codes, accepted: Mask, trusted: Mask, airborne: Mask
     ) -> None:
         tally = self.tally
-        for status in COUNTED:
-            tally.add(f"solves_{status.value}", trusted & (answer.status == STATUSES.index(status)))
+        for code in set(answer.status[trusted].tolist()):
+            if STATUSES[code] in COUNTED:
+                tally.add(f"solves_{STATUSES[code].value}", trusted & (answer.status == code))
         tally.add("iterations", trusted, np.maximum(answer.iterations, 0))
-        tally.add("answers_refused", trusted & ~accepted)
+        if (trusted & ~accepted).any():
+            tally.add("answers_refused", trusted & ~accepted)
         for rung, name in enumerate(FALL_BACKS, start=1):
-            tally.add(f"fall_back_{name}", airborne & (action == rung))
-        slack = np.fmax.reduce(self._contact_slack(answer, accepted), axis=-1)
-        np.fmax(tally.largest_slack_m, slack, out=tally.largest_slack_m)
+            if (airborne & (action == rung)).any():
+                tally.add(f"fall_back_{name}", airborne & (action == rung))
+        np.fmax(tally.largest_slack_m, np.fmax.reduce(slack, axis=-1), out=tally.largest_slack_m)
 
     def _contact_slack(self, answer: BatchResult, accepted: Mask) -> Array:
         """Most that each new plan (run, uav) is inside an obstacle's margin, NaN without one [m]."""

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.formation import PathFrame, formation_offsets, synchronisation_error
+from napf_mpc.jit import compiled
 from napf_mpc.planners.guide import Guide
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.qp import STATES
+from napf_mpc.vehicle.plant import plain
 
 Array = NDArray[np.float64]
-POSITION, VELOCITY = slice(0, 6, 2), slice(1, 6, 2)
-
 LARGEST_PULL_M = 3.0
 """A slot farther than this counts as this far: the UAV comes back at its speed limit, without a lunge."""
 
@@ -59,27 +60,90 @@ class SlotReference:
         """
         place = self.frame.to_path(position)
         ahead = synchronisation_error(place[..., 0], self.offsets[:, 0])
-        behind = _believed(ahead, sigma_m) * np.clip(-ahead, -LARGEST_PULL_M, LARGEST_PULL_M)
-        pace = np.ones(ahead.shape) if guide is None else guide.pace
-        speed = np.repeat((self.speed_mps * pace)[..., None], len(times_s), axis=-1)
-        along = behind[..., None] + speed * times_s
-        bend = np.zeros((*along.shape, 2)) if guide is None else guide.at(along)
-        slope = np.zeros(bend.shape) if guide is None else guide.slope_at(along)
-        here = np.zeros((*ahead.shape, 2)) if guide is None else guide.at(behind[..., None])[:, :, 0]
-        away = self.offsets[:, 1:] + here - place[..., 1:]
-        size = np.sqrt(away[..., 0] ** 2 + away[..., 1] ** 2)
-        pull = _believed(size, sigma_m) * LARGEST_PULL_M / np.maximum(size, LARGEST_PULL_M)
-        across = (away * pull[..., None] - here)[:, :, None] + bend
-        out = np.zeros((*along.shape, STATES))
-        to_slot = np.concatenate([along[..., None], across], axis=-1)
-        out[..., POSITION] = position[:, :, None] + self.frame.directions_to_world(to_slot)
-        velocity = np.concatenate([speed[..., None], speed[..., None] * slope], axis=-1)
-        out[..., VELOCITY] = self.frame.directions_to_world(velocity)
-        out[..., 10] = self.frame.heading_rad
+        sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), ahead.shape)
+        behind = _believed(ahead, sigma) * np.clip(-ahead, -LARGEST_PULL_M, LARGEST_PULL_M)
+        out = np.zeros((*ahead.shape, len(times_s), STATES))
+        _write(
+            plain(position), place, plain(self.offsets), plain(sigma), behind, self.speed_mps,
+            np.ones(ahead.shape) if guide is None else plain(guide.pace),
+            _NO_BEND if guide is None else plain(guide.ahead_m),
+            _NOWHERE if guide is None else plain(guide.offset),
+            plain(times_s), plain(self.frame.axes), self.frame.heading_rad, out,
+        )  # fmt: skip
         return out
 
 
-def _believed(distance_m: Array, sigma_m: Array | float) -> Array:
+_NO_BEND, _NOWHERE = np.empty(0), np.empty((0, 0, 0, 2))
+
+
+@compiled
+def _write(
+    position: Array, place: Array, slots: Array, sigma_m: Array, behind: Array, speed_mps: float, pace: Array,
+    ahead_m: Array, bend: Array, times_s: Array, axes: Array, heading_rad: float, out: Array,
+) -> None:  # fmt: skip
+    """Write states to track into out (run, uav, N, 12), which comes as zeros.
+
+    Parameters
+    ----------
+    position, place : array, shape (run, uav, 3)
+        In the world and on the path [m].
+    slots : array, shape (uav, 3)
+        From the formation's centre [m].
+    sigma_m, behind, pace : array, shape (run, uav)
+        Of the position [m], how far the slot is ahead of it, as far as believed [m], factor on the speed.
+    ahead_m, bend : array, shapes (K,) and (run, uav, K, 2), or without entries
+        A guide's distances, and offsets there [m].
+    axes : array, shape (3, 3)
+        Rows along, left, up.
+    """
+    guided = len(ahead_m) > 0
+    here, there, slope, across, start = np.zeros(2), np.zeros(2), np.zeros(2), np.empty(2), np.empty(2)
+    for run in range(out.shape[0]):
+        for uav in range(out.shape[1]):
+            if guided:
+                _bend(ahead_m, bend[run, uav], behind[run, uav], here, slope)
+            for a in range(2):
+                across[a] = slots[uav, 1 + a] + here[a] - place[run, uav, 1 + a]
+            size = math.sqrt(across[0] * across[0] + across[1] * across[1])
+            square, noise = size * size, sigma_m[run, uav] * sigma_m[run, uav]
+            believed = square / max(square + noise, 1e-12)
+            pull = believed * LARGEST_PULL_M / max(size, LARGEST_PULL_M)
+            for a in range(2):
+                start[a] = across[a] * pull - here[a]
+            speed = speed_mps * pace[run, uav]
+            for n in range(len(times_s)):
+                along = behind[run, uav] + speed * times_s[n]
+                if guided:
+                    _bend(ahead_m, bend[run, uav], along, there, slope)
+                left, up = start[0] + there[0], start[1] + there[1]
+                for a in range(3):
+                    way = along * axes[0, a] + left * axes[1, a] + up * axes[2, a]
+                    out[run, uav, n, 2 * a] = position[run, uav, a] + way
+                    out[run, uav, n, 2 * a + 1] = (
+                        speed * axes[0, a] + speed * slope[0] * axes[1, a] + speed * slope[1] * axes[2, a]
+                    )
+                out[run, uav, n, 10] = heading_rad
+
+
+@compiled
+def _bend(ahead_m: Array, bend: Array, along: float, offset: Array, slope: Array) -> None:
+    """Write a guide's offset and slope at a distance ahead, as :class:`~.guide.Guide` reads them."""
+    spacing, last = ahead_m[1] - ahead_m[0], len(ahead_m) - 1
+    place = along / spacing
+    if not place > 0.0:  # what is not a number would not be a place
+        place = 0.0
+    elif place > last:
+        place = float(last)
+    index = min(int(place), last - 1)
+    part = place - index
+    inside = 0.0 <= along < ahead_m[last]
+    for a in range(2):
+        low, high = bend[index, a], bend[index + 1, a]
+        offset[a] = low + part * (high - low)
+        slope[a] = (high - low) / spacing if inside else 0.0
+
+
+def _believed(distance_m: Array, sigma_m: Array) -> Array:
     """Part of a distance that is not put down to navigation errors."""
     square = distance_m**2
-    return np.asarray(square / np.maximum(square + np.asarray(sigma_m) ** 2, 1e-12))
+    return np.asarray(square / np.maximum(square + sigma_m**2, 1e-12))

@@ -8,8 +8,11 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from napf_mpc.jit import compiled
 from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult
+
+Mask = NDArray[np.bool_]
 
 PRIMAL_LIMIT = 0.01
 """Largest violation of a row [m, m/s, rad or N]: a centimetre is a thirtieth of a UAV's radius, a centimetre
@@ -106,16 +109,21 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
     array of int8, shape (run, uav)
         Codes of :class:`Refusal`.
     """
-    thrusts = np.zeros((*result.inputs.shape[:-1], len(limits.input_lower)))
-    for axis in range(INPUTS):
-        thrusts += limits.input_matrix[:, axis] * result.inputs[..., axis, None]
-    inside = (thrusts >= limits.input_lower - INPUT_TOLERANCE_N).all(axis=(2, 3))
-    inside &= (thrusts <= limits.input_upper + INPUT_TOLERANCE_N).all(axis=(2, 3))
-    finite = np.isfinite(result.states).all(axis=(2, 3)) & np.isfinite(result.inputs).all(axis=(2, 3))
-    for slack in result.slacks:
-        finite &= np.isfinite(slack).all(axis=(2, 3))
+    inside = np.empty(result.status.shape, dtype=np.bool_)
+    _inputs_inside(
+        result.inputs,
+        limits.input_matrix,
+        limits.input_lower - INPUT_TOLERANCE_N,
+        limits.input_upper + INPUT_TOLERANCE_N,
+        inside,
+    )
+    finite = np.ones(result.status.shape, dtype=np.bool_)
+    for values in (result.states, result.inputs, *result.slacks):
+        if values.size:
+            _all_finite(values, finite)
     # A row that is off by what a row may be off costs its multiplier times that.
-    push = np.abs(result.y[..., result.states.shape[-2] * STATES :]).max(-1, initial=0.0)
+    push = np.zeros(result.status.shape)
+    _largest(result.y, result.states.shape[-2] * STATES, push)
     # Each test must hold to pass: NaN fails all of them.
     tests = (
         (Refusal.SKIPPED, result.status != STATUSES.index(QpStatus.SKIPPED)),
@@ -130,6 +138,47 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
     for refusal, passed in reversed(tests):
         why[~passed] = refusal
     return why
+
+
+@compiled
+def _inputs_inside(inputs: Array, matrix: Array, lower: Array, upper: Array, inside: Mask) -> None:
+    """Write whether all inputs (run, uav, N, 4) keep rows between bounds; NaN does not."""
+    for run in range(inputs.shape[0]):
+        for uav in range(inputs.shape[1]):
+            keeps = True
+            for k in range(inputs.shape[2]):
+                for i in range(len(lower)):
+                    value = 0.0
+                    for axis in range(inputs.shape[3]):
+                        value += matrix[i, axis] * inputs[run, uav, k, axis]
+                    keeps = keeps and lower[i] <= value <= upper[i]
+            inside[run, uav] = keeps
+
+
+@compiled
+def _all_finite(values: Array, finite: Mask) -> None:
+    """Clear ``finite`` (run, uav) where a number of values (run, uav, N, m) is not."""
+    for run in range(values.shape[0]):
+        for uav in range(values.shape[1]):
+            for k in range(values.shape[2]):
+                for i in range(values.shape[3]):
+                    if not np.isfinite(values[run, uav, k, i]):
+                        finite[run, uav] = False
+
+
+@compiled
+def _largest(values: Array, first: int, largest: Array) -> None:
+    """Write the largest size of values (run, uav, m) from a place on; NaN if one is not a number."""
+    for run in range(values.shape[0]):
+        for uav in range(values.shape[1]):
+            most = 0.0
+            for i in range(first, values.shape[2]):
+                size = abs(values[run, uav, i])
+                if not size <= most:
+                    most = size
+                    if np.isnan(size):
+                        break
+            largest[run, uav] = most
 
 
 def accepted(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.bool_]:

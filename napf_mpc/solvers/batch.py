@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -11,7 +10,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.qp import Array, HorizonModel, HorizonQp, Layout, QpError, QpStatus, QuadraticProgram, Values
+from napf_mpc.qp import (
+    INPUTS,
+    STATES,
+    Array,
+    HorizonModel,
+    HorizonQp,
+    Layout,
+    QpError,
+    QpStatus,
+    QuadraticProgram,
+    Values,
+)
 from napf_mpc.solvers.residuals import kkt_residuals
 from napf_mpc.solvers.solver import (
     Backend,
@@ -102,15 +112,15 @@ class BatchResult:
         WarmStart
             Cold for programs that were not solved.
         """
-        z = self.z.copy()
-        z[self.status != STATUSES.index(QpStatus.SOLVED)] = np.nan
-        plan = np.concatenate([_flat(states), _flat(inputs)], axis=-1)
-        z[..., : plan.shape[-1]] = np.where(np.isfinite(z[..., :1]), plan, np.nan)
+        runs, uavs, stages = states.shape[:3]
+        z, x, u = np.empty_like(self.z), stages * STATES, stages * (STATES + INPUTS)
+        z[..., :x] = states.reshape(runs, uavs, x)
+        z[..., x:u] = inputs.reshape(runs, uavs, u - x)
+        z[..., u:] = self.z[..., u:]
+        cold = (self.status != STATUSES.index(QpStatus.SOLVED)) | ~np.isfinite(self.z[..., 0])
+        if cold.any():
+            z[cold] = np.nan
         return WarmStart(z, self.y)
-
-
-def _flat(values: Array) -> Array:
-    return values.reshape(*values.shape[:2], math.prod(values.shape[2:]))
 
 
 class BatchSolver(Protocol):

@@ -244,9 +244,7 @@ class ObstacleSet:
         nearest_all(self.solids, self.tree, self.scene_start, array, distance, gradient, index)
         return distance, gradient, index
 
-    def near(
-        self, points: ArrayLike, reach: ArrayLike, limit: int | None = None, together: int = 1
-    ) -> Near:
+    def near(self, points: ArrayLike, reach: ArrayLike, limit: int | None = None, together: int = 1) -> Near:
         """Obstacles whose signed distance is below a reach, sorted by (distance, index).
 
         Parameters

@@ -209,7 +209,15 @@ def near_all(
             count = -1
             if stop > start + 1:
                 count = _candidates(
-                    solids, tree, scene, points[r, start:stop], reaches[r, start:stop], nodes, centre, solid, bound
+                    solids,
+                    tree,
+                    scene,
+                    points[r, start:stop],
+                    reaches[r, start:stop],
+                    nodes,
+                    centre,
+                    solid,
+                    bound,
                 )
             for k in range(start, stop):
                 px, py, pz = points[r, k]
@@ -224,7 +232,17 @@ def near_all(
                         least = bound[c] - away
                         if least < reach and not (held == width and least > keys[0]):
                             held = _offer(
-                                solids, solid[c], scene_start[scene], px, py, pz, reach, keys, names, vectors, held
+                                solids,
+                                solid[c],
+                                scene_start[scene],
+                                px,
+                                py,
+                                pz,
+                                reach,
+                                keys,
+                                names,
+                                vectors,
+                                held,
                             )
                 else:
                     depth = 0
@@ -244,8 +262,17 @@ def near_all(
                             continue
                         for entry in range(tree.first[node], tree.first[node] + tree.size[node]):
                             held = _offer(
-                                solids, tree.order[entry], scene_start[scene], px, py, pz, reach, keys, names,
-                                vectors, held,
+                                solids,
+                                tree.order[entry],
+                                scene_start[scene],
+                                px,
+                                py,
+                                pz,
+                                reach,
+                                keys,
+                                names,
+                                vectors,
+                                held,
                             )
                 for last in range(held - 1, 0, -1):
                     _swap(keys, names, vectors, 0, last)

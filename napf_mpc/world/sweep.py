@@ -154,10 +154,23 @@ def check_steps(
             f"active has shape {flying.shape} and type {flying.dtype}, must be bool of shape {shape[:1]}"
         )
     for name, points in (("p0", start), ("p1", stop)):
-        bad = ~np.isfinite(points).all(axis=(1, 2)) & flying
-        if bad.any():
-            raise ValueError(f"{name} is not finite in run {int(np.argmax(bad))}; mask such runs with active")
+        bad = _first_not_finite(points, flying)
+        if bad >= 0:
+            raise ValueError(f"{name} is not finite in run {bad}; mask such runs with active")
     return start, stop, flying
+
+
+@compiled
+def _first_not_finite(points: NDArray[np.float64], flying: NDArray[np.bool_]) -> int:
+    """First flying run whose points (run, uav, 3) are not finite, or -1."""
+    for r in range(points.shape[0]):
+        if not flying[r]:
+            continue
+        for u in range(points.shape[1]):
+            for axis in range(3):
+                if not np.isfinite(points[r, u, axis]):
+                    return r
+    return -1
 
 
 @compiled
