@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,10 +60,6 @@ class _Steady:
         return self._made[1]
 
 
-def _steady() -> Any:
-    return field(default_factory=_Steady, init=False, repr=False, compare=False)
-
-
 def _positive(**values: float | None) -> None:
     for name, value in values.items():
         if value is not None and not (math.isfinite(value) and value > 0.0):
@@ -88,7 +83,7 @@ class SpeedLimit:
     """Linear price of a slack [1/(m/s s)]."""
     w2: float = SPEED_W2
     """Quadratic price of a slack [1/((m/s)^2 s)]."""
-    _kept: _Steady = _steady()
+    _kept: _Steady = field(default_factory=_Steady, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         _positive(max_mps=self.max_mps, max_climb_mps=self.max_climb_mps)
@@ -136,7 +131,7 @@ class TiltLimit:
     """Linear price of a slack [1/(rad s)]."""
     w2: float = TILT_W2
     """Quadratic price of a slack [1/(rad^2 s)]."""
-    _kept: _Steady = _steady()
+    _kept: _Steady = field(default_factory=_Steady, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         _positive(max_rad=self.max_rad)
@@ -316,7 +311,7 @@ class InputBox:
     """Largest angular acceleration in roll and pitch [rad/s^2]."""
     yaw_radps2: float = 5.0
     """Largest angular acceleration in yaw [rad/s^2]."""
-    _kept: _Steady = _steady()
+    _kept: _Steady = field(default_factory=_Steady, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         _positive(turn_radps2=self.turn_radps2, yaw_radps2=self.yaw_radps2)

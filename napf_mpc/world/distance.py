@@ -55,6 +55,15 @@ def length3(x: float, y: float, z: float) -> float:
 
 
 @compiled
+def ball_distance(dx: float, dy: float, dz: float, radius: float) -> tuple[float, float, float, float]:
+    """Signed distance [m] of a ball about the origin, and its gradient (d, gx, gy, gz)."""
+    radial = length3(dx, dy, dz)
+    if radial < TOUCH_M:
+        return radial - radius, 0.0, 0.0, 1.0
+    return radial - radius, dx / radial, dy / radial, dz / radial
+
+
+@compiled
 def signed_distance(
     solids: Solids, i: int, px: float, py: float, pz: float
 ) -> tuple[float, float, float, float]:
@@ -64,11 +73,7 @@ def signed_distance(
     dx = px - row[i, X]
     dy = py - row[i, Y]
     if kind == SPHERE:
-        dz = pz - row[i, BASE]
-        radial = length3(dx, dy, dz)
-        if radial < TOUCH_M:
-            return radial - row[i, A], 0.0, 0.0, 1.0
-        return radial - row[i, A], dx / radial, dy / radial, dz / radial
+        return ball_distance(dx, dy, pz - row[i, BASE], row[i, A])
     if kind == CYLINDER:
         d2, gx, gy = _disc(dx, dy, row[i, A])
     elif kind == BOX:

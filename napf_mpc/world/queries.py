@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
 from napf_mpc.world.bounding_tree import STACK, BoxTree, box_distance
-from napf_mpc.world.distance import Solids, length3, signed_distance
+from napf_mpc.world.distance import BASE, SPHERE, A, Solids, X, Y, ball_distance, length3, signed_distance
 
 
 @compiled
@@ -194,12 +194,15 @@ def near_all(
 ) -> None:
     """Answer `ObstacleSet.near` in place; the arrays hold their padding and are at least one wide.
 
-    `together` points in a row are searched as one: see :func:`_candidates`. It changes no answer.
+    So many points in a row as `together` says share a search, see :func:`_candidates`; it changes no answer.
     """
     nodes = np.empty(STACK, dtype=np.int64)
     solid = np.empty(CANDIDATES, dtype=np.int64)
-    bound = np.empty(CANDIDATES)
+    from_centre = np.empty(CANDIDATES)
     centre = np.empty(3)
+    found = np.empty((CANDIDATES, 4))
+    order = np.empty(CANDIDATES, dtype=np.int64)
+    row = solids.parameters
     shared = len(scene_start) == 2
     width = distance.shape[2]
     for r in range(points.shape[0]):
@@ -207,73 +210,84 @@ def near_all(
         for start in range(0, points.shape[1], together):
             stop = min(start + together, points.shape[1])
             count = -1
-            if stop > start + 1:
-                count = _candidates(
-                    solids,
-                    tree,
-                    scene,
-                    points[r, start:stop],
-                    reaches[r, start:stop],
-                    nodes,
-                    centre,
-                    solid,
-                    bound,
-                )
-            for k in range(start, stop):
+            if together > 1:
+                ours, theirs = points[r, start:stop], reaches[r, start:stop]
+                count = _candidates(solids, tree, scene, ours, theirs, nodes, centre, solid, from_centre)
+            for k in range(start, stop if count >= 0 else start):
+                px, py, pz = points[r, k, 0], points[r, k, 1], points[r, k, 2]
+                reach = reaches[r, k]
+                away = length3(px - centre[0], py - centre[1], pz - centre[2]) + BOUND_M
+                held = 0
+                for c in range(count):
+                    if from_centre[c] - away >= reach:
+                        continue
+                    i = solid[c]
+                    if solids.kind[i] == SPHERE:
+                        d, gx, gy, gz = ball_distance(
+                            px - row[i, X], py - row[i, Y], pz - row[i, BASE], row[i, A]
+                        )
+                    else:
+                        d, gx, gy, gz = signed_distance(solids, i, px, py, pz)
+                    if d >= reach:
+                        continue
+                    found[c, 0], found[c, 1], found[c, 2], found[c, 3] = d, gx, gy, gz
+                    at = held
+                    while at > 0 and (
+                        found[order[at - 1], 0] > d
+                        or (found[order[at - 1], 0] == d and solid[order[at - 1]] > i)
+                    ):
+                        at -= 1
+                    if at == width:
+                        continue
+                    held = min(held + 1, width)
+                    for later in range(held - 1, at, -1):
+                        order[later] = order[later - 1]
+                    order[at] = c
+                for n in range(held):
+                    c = order[n]
+                    distance[r, k, n] = found[c, 0]
+                    index[r, k, n] = solid[c] - scene_start[scene]
+                    for axis in range(3):
+                        gradient[r, k, n, axis] = found[c, 1 + axis]
+            for k in range(start if count < 0 else stop, stop):
                 px, py, pz = points[r, k]
                 keys = distance[r, k]
                 names = index[r, k]
                 vectors = gradient[r, k]
                 held = 0
                 reach = reaches[r, k]
-                if count >= 0:
-                    away = length3(px - centre[0], py - centre[1], pz - centre[2]) + BOUND_M
-                    for c in range(count):
-                        least = bound[c] - away
-                        if least < reach and not (held == width and least > keys[0]):
-                            held = _offer(
-                                solids,
-                                solid[c],
-                                scene_start[scene],
-                                px,
-                                py,
-                                pz,
-                                reach,
-                                keys,
-                                names,
-                                vectors,
-                                held,
-                            )
-                else:
-                    depth = 0
-                    if tree.root[scene] >= 0:
-                        nodes[0] = tree.root[scene]
-                        depth = 1
-                    while depth > 0:
-                        depth -= 1
-                        node = nodes[depth]
-                        least = box_distance(tree.box, node, px, py, pz)
-                        if least >= reach or (held == width and least > keys[0]):
+                depth = 0
+                if tree.root[scene] >= 0:
+                    nodes[0] = tree.root[scene]
+                    depth = 1
+                while depth > 0:
+                    depth -= 1
+                    node = nodes[depth]
+                    bound = box_distance(tree.box, node, px, py, pz)
+                    if bound >= reach or (held == width and bound > keys[0]):
+                        continue
+                    if tree.right[node] >= 0:
+                        nodes[depth] = tree.right[node]
+                        nodes[depth + 1] = node + 1
+                        depth += 2
+                        continue
+                    for entry in range(tree.first[node], tree.first[node] + tree.size[node]):
+                        i = tree.order[entry]
+                        d, gx, gy, gz = signed_distance(solids, i, px, py, pz)
+                        if d >= reach:
                             continue
-                        if tree.right[node] >= 0:
-                            nodes[depth] = tree.right[node]
-                            nodes[depth + 1] = node + 1
-                            depth += 2
-                            continue
-                        for entry in range(tree.first[node], tree.first[node] + tree.size[node]):
-                            held = _offer(
-                                solids,
-                                tree.order[entry],
-                                scene_start[scene],
-                                px,
-                                py,
-                                pz,
-                                reach,
-                                keys,
-                                names,
-                                vectors,
-                                held,
-                            )
+                        name = i - scene_start[scene]
+                        if held < width:
+                            keys[held] = d
+                            names[held] = name
+                            _set(vectors, held, gx, gy, gz)
+                            held += 1
+                            _rise(keys, names, vectors, held - 1)
+                        elif d < keys[0] or (d == keys[0] and name < names[0]):
+                            keys[0] = d
+                            names[0] = name
+                            _set(vectors, 0, gx, gy, gz)
+                            _sink(keys, names, vectors, 0, held)
                 for last in range(held - 1, 0, -1):
                     _swap(keys, names, vectors, 0, last)
                     _sink(keys, names, vectors, 0, last)
@@ -300,7 +314,7 @@ def _candidates(
     """Obstacles that may be within reach of any of some points, or -1 if that are too many to be of use.
 
     A signed distance changes by no more than the way gone, so that from the middle of the points one look
-    settles which obstacles can matter at all; and, as `bound` is the distance there, which can at a point.
+    settles which obstacles can matter at all; `bound`, the distance there, says which of them can at a point.
     """
     lower, upper = np.inf * np.ones(3), -np.inf * np.ones(3)
     reach = -np.inf
@@ -342,39 +356,6 @@ def _candidates(
                 bound[count] = d
                 count += 1
     return count
-
-
-@compiled
-def _offer(
-    solids: Solids,
-    i: int,
-    first: int,
-    px: float,
-    py: float,
-    pz: float,
-    reach: float,
-    keys: NDArray[np.float64],
-    names: NDArray[np.int64],
-    vectors: NDArray[np.float64],
-    held: int,
-) -> int:
-    """Offer solid i to the heap of the nearest; return how many it holds now."""
-    d, gx, gy, gz = signed_distance(solids, i, px, py, pz)
-    if d >= reach:
-        return held
-    name = i - first
-    if held < len(keys):
-        keys[held] = d
-        names[held] = name
-        _set(vectors, held, gx, gy, gz)
-        _rise(keys, names, vectors, held)
-        return held + 1
-    if d < keys[0] or (d == keys[0] and name < names[0]):
-        keys[0] = d
-        names[0] = name
-        _set(vectors, 0, gx, gy, gz)
-        _sink(keys, names, vectors, 0, held)
-    return held
 
 
 # A heap with the farthest (distance, index) at its top keeps the nearest few and ends as a sorted row, in
