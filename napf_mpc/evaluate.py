@@ -20,7 +20,7 @@ from napf_mpc.safety_distance import Inflation
 from napf_mpc.vehicle.quadrotor import hover_input
 from napf_mpc.world.distance import COS, SIN, Solids, X, Y, solid_bounds
 from napf_mpc.world.moving_sweep import MovingClearance
-from napf_mpc.world.sweep import SweptClearance, swept_separation
+from napf_mpc.world.sweep import SweptClearance, check_steps, separate
 
 Array = NDArray[np.float64]
 
@@ -144,14 +144,14 @@ class MissionScore:
 
     def moved(self, time_s: float, before: Array, after: Array, active: Mask) -> None:
         """Sweep one physics step against the solids and the other UAVs."""
-        p0 = np.ascontiguousarray(before[..., POSITION])
-        p1 = np.ascontiguousarray(after[..., POSITION])
-        self._clearance.update(p0, p1, active)
+        p0, p1, active = check_steps(
+            before[..., POSITION], after[..., POSITION], active, self._separation.shape
+        )
+        self._clearance.take_in(p0, p1, active)
         if self._moving is not None:
             self._moving.update(time_s - self._problem.simulation.step_s, time_s, p0, p1, active)
         if time_s > APART_S and p0.shape[1] > 1:
-            nearest = swept_separation(p0, p1)
-            np.minimum(self._separation, nearest, out=self._separation, where=active[:, None])
+            separate(p0, p1, active, self._separation)
         _travel(p0, p1, active, self._frame.origin, self._frame.along, self._flown, self._end)
 
     def ticked(

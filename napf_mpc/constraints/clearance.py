@@ -184,8 +184,8 @@ def _half_space(covariance: Array, normal: Array, inflation: Inflation) -> Array
     """Margins (run, uav, N, m) against flat walls."""
     if inflation.reading not in ("directional", "chi2"):
         return plain(inflation.margin(covariance, normal))
+    points, m = math.prod(normal.shape[:-2]), normal.shape[-2]
     size = np.empty(normal.shape[:-1])
-    points, m = size[..., 0].size, size.shape[-1]
     _directional(
         plain(covariance).reshape(points, 3, 3),
         normal.reshape(points, m, 3),

@@ -362,12 +362,9 @@ def margin_attainable(
     """  # noqa: E501
     if not isinstance(problem.mission, FormationMission):
         raise ConstraintError('mission.kind must be "formation": a lone point has no neighbours')
-    frame = _frame(problem.mission)
-    offset = slot_offsets(problem, frame)
-    uavs = len(offset)
-    normal, reach = tangent(offset, _distance(distance_m, problem), stretch, _aside(uavs, frame))
-    inflation = inflation or Inflation.of_problem(problem)
-    room = _dot(normal, offset)
+    distance_m = _distance(distance_m, problem)
+    normal, room, reach = _between_slots(problem.formation, problem.mission, distance_m, stretch)
+    inflation, uavs = inflation or Inflation.of_problem(problem), len(room)
     if inflation.reading not in ("directional", "chi2"):
         relative = relative_covariance(covariance, common_factor)
         margin = _margin(inflation, relative, np.broadcast_to(normal, relative.shape[:-1]))
@@ -405,8 +402,15 @@ def _keeps(
 
 
 @lru_cache(maxsize=16)
-def _frame(mission: FormationMission) -> PathFrame:
-    return PathFrame.of_mission(mission)
+def _between_slots(
+    formation: Formation, mission: FormationMission, distance_m: float, stretch: float
+) -> tuple[Array, Array, Array]:
+    """Planes between the slots of a formation: normals, the slots' distance along them, and reach."""
+    frame = PathFrame.of_mission(mission)
+    slots = frame.to_world(_slots(formation))
+    offset = slots[:, None, :] - slots[None, :, :]
+    normal, reach = tangent(offset, distance_m, stretch, _aside(len(offset), frame))
+    return normal, _dot(normal, offset), reach
 
 
 @lru_cache(maxsize=16)

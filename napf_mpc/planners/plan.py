@@ -36,6 +36,18 @@ def _maps(vehicle: Vehicle, yaw_rad: float, into_s: tuple[float, ...]) -> tuple[
 
 
 @compiled
+def _find(starts_s: Array, made_s: float, times_s: Array, stage: Index, into_s: Array) -> None:
+    """Write the stage of each time, the last one endless, and how far into it the time is [s]."""
+    for n in range(len(times_s)):
+        age = max(0.0, times_s[n] - made_s)
+        k = 0
+        # A node belongs to the stage that starts there; rounding of the clock must not look one stage back.
+        while k + 1 < len(starts_s) and starts_s[k + 1] <= age + 1e-9:
+            k += 1
+        stage[n], into_s[n] = k, max(0.0, age - starts_s[k])
+
+
+@compiled
 def _carry(nodes: Array, held: Array, stage: Index, which: Index, a: Array, b: Array, out: Array) -> None:
     """Write states at some times into out (run, uav, time, 12).
 
@@ -165,25 +177,25 @@ class Plan:
 
         After the last stage the inputs are zero and the model runs on.
         """
-        age, stage = self._stage(np.array([time_s]))
-        return self._states_at(age, stage)[:, :, 0], self._inputs[:, :, stage[0]]
+        stage, into = self._stages(np.array([time_s]))
+        state = self._states_at(stage, into).reshape(self.initial.shape)
+        return state, np.ascontiguousarray(self._inputs[:, :, stage[0]])
 
     def resampled(self, time_s: float, step_s: Array) -> tuple[Array, Array]:
         """States (run, uav, N, 12) and inputs (run, uav, N, 4) of these plans on a grid that starts later."""
         times = time_s + np.cumsum(step_s)
-        _, during = self._stage(times - step_s)
-        return self._states_at(*self._stage(times)), self._inputs.take(during, axis=2)
+        during, _ = self._stages(times - step_s)
+        return self._states_at(*self._stages(times)), self._inputs.take(during, axis=2)
 
-    def _stage(self, times_s: Array) -> tuple[Array, Index]:
-        """Ages [s] and stages at times (n,)."""
-        age = np.maximum(0.0, times_s - self.made_s)
-        # A node belongs to the stage that starts there; rounding of the clock must not look one stage back.
-        return age, np.searchsorted(self._starts[1:], age + 1e-9, side="right")
+    def _stages(self, times_s: Array) -> tuple[Index, Array]:
+        """Stages at times (n,), and how far into them the times are [s]."""
+        stage, into = np.empty(len(times_s), dtype=np.int64), np.empty(len(times_s))
+        _find(self._starts, self.made_s, times_s, stage, into)
+        return stage, into
 
-    def _states_at(self, age_s: Array, stage: Index) -> Array:
-        """States (run, uav, n, 12) at ages in stages, both (n,)."""
-        into = np.maximum(0.0, age_s - self._starts[stage]).tolist()
-        rounded = tuple(round(time, 9) if time >= 1e-9 else 0.0 for time in into)
+    def _states_at(self, stage: Index, into_s: Array) -> Array:
+        """States (run, uav, n, 12) in stages, some time after their starts, both (n,)."""
+        rounded = tuple([round(time, 9) if time >= 1e-9 else 0.0 for time in into_s.tolist()])
         out = np.empty((*self.initial.shape[:2], len(rounded), STATES))
         _carry(self._nodes, self._inputs, stage, *_maps(self.vehicle, self.yaw_rad, rounded), out)
         return out

@@ -71,7 +71,12 @@ class SweptClearance:
         ValueError
             If a shape does not fit or a position of an active run is not finite.
         """
-        start, stop, flying = check_steps(p0, p1, active, self.clearance.shape)
+        self.take_in(*check_steps(p0, p1, active, self.clearance.shape))
+
+    def take_in(
+        self, start: NDArray[np.float64], stop: NDArray[np.float64], flying: NDArray[np.bool_]
+    ) -> None:
+        """Take in one step whose numbers :func:`check_steps` gave."""
         _update(
             self.obstacles.solids,
             self.obstacles.tree,
@@ -135,7 +140,7 @@ def swept_separation(p0: ArrayLike, p1: ArrayLike, active: ArrayLike | None = No
     """
     start, stop, flying = check_steps(p0, p1, active, np.shape(p0)[:2])
     separation = np.full(start.shape[:2], np.inf)
-    _separate(start, stop, flying, separation)
+    separate(start, stop, flying, separation)
     return separation
 
 
@@ -268,12 +273,13 @@ def _swept(
 
 
 @compiled
-def _separate(
+def separate(
     start: NDArray[np.float64],
     stop: NDArray[np.float64],
     flying: NDArray[np.bool_],
     separation: NDArray[np.float64],
 ) -> None:
+    """Lower running minima (run, uav) of :func:`swept_separation` by a step that :func:`check_steps` gave."""
     for r in range(start.shape[0]):
         if not flying[r]:
             continue
