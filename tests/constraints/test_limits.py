@@ -249,3 +249,19 @@ def test_the_box_holds_in_rows_as_it_is() -> None:
 def test_a_box_without_hover_is_refused(settings: dict[str, float], name: str) -> None:
     with pytest.raises(ConstraintError, match=name):
         InputBox(**settings)
+
+
+@pytest.mark.parametrize("limit", [SpeedLimit(), TiltLimit(), InputBox()], ids=lambda limit: limit.name)
+def test_rows_are_made_again_only_when_what_they_follow_from_changes(limit: Constraint) -> None:
+    now = horizon()
+    assert limit.rows(now) is limit.rows(now)
+    faster, more = (
+        horizon(speed_mps=3.0),
+        sample_horizon(np.random.default_rng(1), ObstacleSet.empty(), runs=3),
+    )
+    heavier = replace(now, problem=now.problem.model_copy(update={"vehicle": Vehicle(mass_kg=2.0)}))
+    for other in (faster, more, heavier, now):
+        kept, fresh = limit.rows(other), type(limit)().rows(other)
+        for name in ("jac", "lower", "upper", "w1", "w2"):
+            if getattr(fresh, name) is not None:
+                np.testing.assert_array_equal(getattr(kept, name), getattr(fresh, name))

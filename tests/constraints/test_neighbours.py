@@ -20,7 +20,7 @@ from napf_mpc.constraints.neighbours import (
 from napf_mpc.constraints.probability import ellipsoid_half_space_bound
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import Problem
-from napf_mpc.safety_distance import Inflation
+from napf_mpc.safety_distance import Inflation, directional_sigma
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -239,3 +239,24 @@ def test_a_short_gap_is_asked_to_open_at_a_speed_and_never_to_less_than_the_bare
 def test_caps_that_mean_nothing_are_refused(name: str, value: float) -> None:
     with pytest.raises(ConstraintError, match=f"{name} = "):
         NeighbourSeparation(1, **{name: value})
+
+
+def test_rows_are_made_of_the_tangent_and_the_relative_covariance() -> None:
+    """The compiled loop against the plain functions: all pairs of four UAVs, correlated errors, a stretch."""
+    rng = np.random.default_rng(11)
+    horizon = sample_horizon(rng, ObstacleSet.empty(), runs=3)
+    inflation = Inflation(2.0)
+    rows = NeighbourSeparation(3, 1.2, stretch=2.5, share=1.0, inflation=inflation, reach_m=1e6).rows(horizon)
+    position = horizon.position.transpose(0, 2, 1, 3)
+    offset = position[:, :, :, None] - position[:, :, None]
+    normal, reach = tangent(offset, 1.2, 2.5, np.array([0.0, 1.0, 0.0]))
+    relative = relative_covariance(
+        horizon.covariance.transpose(0, 2, 1, 3, 4), horizon.common_factor[:, None]
+    )
+    required = reach + inflation.k * directional_sigma(relative, normal)
+    assert rows.lower is not None
+    for uav in range(4):
+        others = [other for other in range(4) if other != uav]
+        np.testing.assert_array_equal(rows.jac[:, uav], normal[:, :, uav, others])
+        level = (normal[:, :, uav, others] * position[:, :, others]).sum(-1) + required[:, :, uav, others]
+        np.testing.assert_allclose(rows.lower[:, uav], level, atol=1e-9)

@@ -18,9 +18,11 @@ from napf_mpc.constraints.probability import (
     mission_share,
     reach_margin,
     reach_probability,
+    sigma_along,
 )
 from napf_mpc.first_passage import mission_k
 from napf_mpc.navigation.processes import gauss_markov
+from napf_mpc.safety_distance import directional_sigma
 
 OFFSET = np.array([0.7, 0.7, 0.8])
 COVARIANCE = np.diag([0.04, 0.04, 0.01])
@@ -168,3 +170,14 @@ def test_a_mission_beside_a_small_solid_costs_a_third_to_the_whole_of_what_is_as
     achieved = float(((error**2).sum(1) <= radius**2).any(-1).mean())
     spread = 3.0 * math.sqrt(asked / runs)
     assert 0.3 * asked - spread <= achieved <= asked + spread
+
+
+def test_the_compiled_directional_sigma_is_the_plain_one_to_the_last_bit() -> None:
+    rng = np.random.default_rng(8)
+    root = rng.standard_normal((200, 3, 3))
+    covariance = root @ root.transpose(0, 2, 1)
+    normal = rng.standard_normal((200, 3))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    compiled = [sigma_along(c, *n) for c, n in zip(covariance, normal.tolist(), strict=True)]
+    np.testing.assert_array_equal(compiled, directional_sigma(covariance, normal))
+    assert sigma_along(np.zeros((3, 3)), 1.0, 0.0, 0.0) == 0.0

@@ -119,6 +119,36 @@ def test_a_run_asks_its_own_scene_or_the_only_one():
         together.near(points[:2], 1.0)
 
 
+@pytest.mark.parametrize("limit", [1, 4, 100])
+@pytest.mark.parametrize("together", [2, 20, 1000])
+def test_points_searched_together_have_the_answers_of_each_alone(limit: int, together: int):
+    """Paths of 20 points, scenes too dense to list, an endless reach and none: the same bits."""
+    rng = np.random.default_rng(limit + together)
+    sets = [ObstacleSet.from_shapes(mixed(rng, n)) for n in (60, 0, 400, 1)]
+    obstacles = ObstacleSet.stack(sets)
+    start = rng.uniform(-100.0, 2100.0, (4, 10, 1, 3))
+    way = np.cumsum(rng.normal((2.0, 1.0, 0.0), 2.0, (4, 10, 20, 3)), axis=2)
+    points = (start + way).reshape(4, 200, 3)
+    points[0, :20] = 1e9 + points[0, :20]
+    reach = rng.uniform(0.0, 60.0, (4, 200))
+    reach[2, ::7], reach[0, 60:80], reach[2, 100:103] = 300.0, -np.inf, np.inf
+    alone = obstacles.near(points, reach, limit)
+    near = obstacles.near(points, reach, limit, together=together)
+    np.testing.assert_array_equal(near.index, alone.index)
+    np.testing.assert_array_equal(near.distance, alone.distance)
+    np.testing.assert_array_equal(near.gradient, alone.gradient)
+    assert (near.index[2] >= 0).any()
+    with pytest.raises(ValueError, match="together = 0, must be >= 1"):
+        obstacles.near(points, reach, limit, together=0)
+
+
+def test_equal_distances_searched_together_are_ordered_by_index():
+    """Thirty copies of one sphere and two mirror images: ties everywhere."""
+    obstacles = ObstacleSet.from_shapes([Sphere((0.0, 10.0 * (-1.0) ** i, 0.0), 2.0) for i in range(30)])
+    near = obstacles.near(np.zeros((1, 3, 3)), 20.0, limit=4, together=3)
+    np.testing.assert_array_equal(near.index[0], [np.arange(4)] * 3)
+
+
 def test_answers_do_not_depend_on_the_batch():
     """A shared world asked by 50 runs at once, one at a time, and point by point: the same bits."""
     rng = np.random.default_rng(4)
