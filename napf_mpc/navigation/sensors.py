@@ -7,8 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.jit import compiled
 from napf_mpc.problem import Navigation
 from napf_mpc.streams import NormalSequence, Stream
+from napf_mpc.vehicle.plant import plain
 
 __all__ = ["Sensors", "bias_memory"]
 
@@ -73,10 +75,25 @@ class Sensors:
 
     def velocity_change(self, velocity: Array) -> Array:
         """Measured change of the velocity over a tick that ends with the given true one (run, uav, 3)."""
-        measured = velocity - self._velocity
-        measured += self._period_s * self._bias
-        measured += self._noise_sigma * self._noise.take()
-        self._bias *= self._memory
-        self._bias += self._new_bias_sigma * self._bias_noise.take()
-        self._velocity[...] = velocity
+        measured = np.empty(velocity.shape)
+        _measure(
+            plain(velocity), self._velocity, self._bias, self._noise.take(), self._bias_noise.take(),
+            self._period_s, self._noise_sigma, self._memory, self._new_bias_sigma, measured,
+        )  # fmt: skip
         return measured
+
+
+@compiled
+def _measure(
+    velocity: Array, before: Array, bias: Array, noise: Array, new: Array, period_s: float,
+    noise_sigma: float, memory: float, new_bias_sigma: float, measured: Array,
+) -> None:  # fmt: skip
+    """Write the velocity change (run, uav, 3) that is measured, and carry bias and velocity on, in place."""
+    for run in range(measured.shape[0]):
+        for uav in range(measured.shape[1]):
+            for axis in range(3):
+                at = run, uav, axis
+                change = velocity[at] - before[at] + period_s * bias[at]
+                measured[at] = change + noise_sigma * noise[at]
+                bias[at] = bias[at] * memory + new_bias_sigma * new[at]
+                before[at] = velocity[at]

@@ -15,6 +15,7 @@ from napf_mpc.constraints.moving import MovingObstacleContact
 from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
+from napf_mpc.jit import compiled
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
@@ -248,21 +249,19 @@ class QpPlanner:
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
-        origin = state[..., POSITION]
+        origin = np.ascontiguousarray(state[..., POSITION])
         blocks: list[LinearRows] = [constraint.rows(horizon) for constraint in self.constraints]
         for constraint, block in zip(self.constraints, blocks, strict=True):
             block.check_shapes(horizon.shape, constraint.name)
         blocks = [block.shifted(origin) if block.signal == "position" else block for block in blocks]
-        return HorizonQp(
-            self._model, _moved(state, -origin), _moved(reference, -origin[:, :, None]), tuple(blocks)
-        )
+        return HorizonQp(self._model, _moved(state, -origin), _moved(reference, -origin), tuple(blocks))
 
     def _solve(
         self, state: Array, reference: Array, nav: NavSolution, trusted: Mask, time_s: float
     ) -> BatchResult:
         """Answers in the world's coordinates, after as many passes as the problem asks for."""
         states, inputs = self._guess(state, reference, time_s)
-        origin, answer = state[:, :, None, POSITION], self._answer
+        origin, answer = np.ascontiguousarray(state[..., POSITION]), self._answer
         asked: Mask = np.asarray(trusted.any(-1))
         for turn in range(self.problem.planner.passes):
             if turn and answer is not None:
@@ -298,7 +297,7 @@ class QpPlanner:
         old, step_s = self._plan, self._model.step_s
         new = Plan(
             self.problem.vehicle, self._yaw, time_s, step_s, state,
-            _moved(answer.states, state[:, :, None, POSITION]), answer.inputs,
+            _moved(answer.states, np.ascontiguousarray(state[..., POSITION])), answer.inputs,
         )  # fmt: skip
         if accepted.all():
             self._made_s[:] = time_s
@@ -367,7 +366,19 @@ def _sigma(nav: NavSolution, trusted: Mask) -> Array:
 
 
 def _moved(states: Array, by: Array) -> Array:
-    """States (..., 12) with their positions moved by (..., 3)."""
-    out = states.copy()
-    out[..., POSITION] += by
+    """States (run, uav, ..., 12) with their positions moved by (run, uav, 3), the same at all stages."""
+    out = np.empty(states.shape)
+    runs, uavs = states.shape[:2]
+    _move(states.reshape(runs, uavs, -1, STATES), by, out.reshape(runs, uavs, -1, STATES))
     return out
+
+
+@compiled
+def _move(states: Array, by: Array, out: Array) -> None:
+    for run in range(states.shape[0]):
+        for uav in range(states.shape[1]):
+            for k in range(states.shape[2]):
+                for i in range(STATES):
+                    out[run, uav, k, i] = states[run, uav, k, i]
+                for axis in range(3):
+                    out[run, uav, k, 2 * axis] += by[run, uav, axis]

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from napf_mpc.jit import compiled
 from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult
+from napf_mpc.vehicle.plant import plain
 
 Mask = NDArray[np.bool_]
 
@@ -121,9 +122,9 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
     for values in (result.states, result.inputs, *result.slacks):
         if values.size:
             _all_finite(values, finite)
-    # A row that is off by what a row may be off costs its multiplier times that.
-    push = np.zeros(result.status.shape)
-    _largest(result.y, result.states.shape[-2] * STATES, push)
+    balanced = np.empty(result.status.shape, dtype=np.bool_)
+    first = result.states.shape[-2] * STATES
+    _balanced(plain(result.y), first, plain(result.complementarity), limits.complementarity, balanced)
     # Each test must hold to pass: NaN fails all of them.
     tests = (
         (Refusal.SKIPPED, result.status != STATUSES.index(QpStatus.SKIPPED)),
@@ -132,7 +133,7 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
         (Refusal.INPUT, inside),
         (Refusal.PRIMAL, result.primal <= limits.primal),
         (Refusal.DUAL, result.dual <= limits.dual),
-        (Refusal.COMPLEMENTARITY, result.complementarity <= limits.complementarity + PRIMAL_LIMIT * push),
+        (Refusal.COMPLEMENTARITY, balanced),
     )
     why = np.full(result.status.shape, Refusal.NONE, dtype=np.int8)
     for refusal, passed in reversed(tests):
@@ -167,18 +168,21 @@ def _all_finite(values: Array, finite: Mask) -> None:
 
 
 @compiled
-def _largest(values: Array, first: int, largest: Array) -> None:
-    """Write the largest size of values (run, uav, m) from a place on; NaN if one is not a number."""
-    for run in range(values.shape[0]):
-        for uav in range(values.shape[1]):
-            most = 0.0
-            for i in range(first, values.shape[2]):
-                size = abs(values[run, uav, i])
-                if not size <= most:
-                    most = size
-                    if np.isnan(size):
-                        break
-            largest[run, uav] = most
+def _balanced(y: Array, first: int, complementarity: Array, limit: float, balanced: Mask) -> None:
+    """Write whether complementarity (run, uav) is small beside the multipliers y (run, uav, m) of the rows.
+
+    A row that is off by what a row may be off costs its multiplier times that. NaN is never balanced.
+    """
+    for run in range(y.shape[0]):
+        for uav in range(y.shape[1]):
+            missing = 0
+            for i in range(first, y.shape[2]):
+                missing += y[run, uav, i] != y[run, uav, i]
+            push = 0.0
+            if not complementarity[run, uav] <= limit:
+                for i in range(first, y.shape[2]):
+                    push = max(push, abs(y[run, uav, i]))
+            balanced[run, uav] = missing == 0 and complementarity[run, uav] <= limit + PRIMAL_LIMIT * push
 
 
 def accepted(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.bool_]:
