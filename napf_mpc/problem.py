@@ -677,6 +677,8 @@ class Planner(_Section):
     """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]."""
     contact_extra_m: float = Field(0.0, ge=0.0, le=1e3)
     """QP planner: distance kept from obstacles on top of the margin."""
+    altitude_m: tuple[Coordinate, Coordinate] | None = None
+    """QP planner: least and largest height to fly at; none by default."""
     influence_scale: float = Field(0.01, ge=1e-9, le=1e6)
     """QP planner: price per metre and second for each m/s of NAPF's repulsion."""
     k: Annotated[float, Field(ge=0.0, le=20.0)] | None = None
@@ -707,6 +709,9 @@ class Planner(_Section):
             raise ValueError('sigma = "chi2" needs confidence (k follows from it)')
         if self.confidence is not None and self.confidence > 1.0 - 1e-12:
             raise ValueError(f"confidence = {self.confidence!r} must be <= 1 - 1e-12")
+        if self.altitude_m is not None and not self.altitude_m[0] < self.altitude_m[1]:
+            low, high = self.altitude_m
+            raise ValueError(f"altitude_m must be [low, high] with low < high, got [{low:g}, {high:g}]")
         if self.min_distance_m > self.influence_m:
             raise ValueError(
                 f"min_distance_m = {self.min_distance_m:g} must be <= influence_m = {self.influence_m:g}"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
-from napf_mpc.constraints.limits import InputBox, SpeedLimit, TiltLimit
+from napf_mpc.constraints.limits import AltitudeBand, InputBox, SpeedLimit, TiltLimit
 from napf_mpc.constraints.moving import MovingObstacleContact
 from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
 from napf_mpc.errors import NapfError, ProblemError
@@ -68,6 +68,9 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     if problem.world.moving:
         count = min(rows, len(problem.world.moving))
         others.append(MovingObstacleContact(obstacles=count, w1=price, extra_m=settings.contact_extra_m))
+    if settings.altitude_m is not None:
+        low, high = settings.altitude_m
+        others.append(AltitudeBand(low, high))
     speed = SpeedLimit(w1=SPEED_PRICE[0], w2=SPEED_PRICE[1])
     return [contact, influence, *others, speed, TiltLimit(), InputBox()]
 
