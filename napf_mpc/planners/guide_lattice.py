@@ -158,71 +158,76 @@ def _half_step(low: float, high: float, step_m: float) -> float:
 def cover(
     sight: Sight, i: int, lattice: Lattice, below: int, s: int, v0: int, v1: int, low: int, high: int
 ) -> None:
-    """Make sure that the shortfalls of UAV i in the cells low ... high of layers v0 ... v1 are known."""
+    """Make sure that the shortfalls of UAV i in the cells low ... high of layers v0 ... v1 are known.
+
+    Only where a solid's reach crosses a row they are worked out; the largest of all solids counts.
+    """
+    near = sight.near
+    missing = sight.missing
     known = sight.known
+    lane = sight.lanes[i, 0]
+    cell = lattice.cell_m
+    half = lattice.half
+    station = sight.along[i] + s * lattice.step_m
     for v in range(v0, v1 + 1):
         k0 = known[i, s, v, 0]
         k1 = known[i, s, v, 1]
         if k0 <= low and high <= k1:
             continue
+        # What is known is one stretch of cells: it grows to the left, to the right or both.
         if k1 < k0:
-            _fill(sight, i, lattice, below, s, v, low, high)
-            known[i, s, v, 0] = low
-            known[i, s, v, 1] = high
-            continue
-        if low < k0:
-            _fill(sight, i, lattice, below, s, v, low, k0 - 1)
-            known[i, s, v, 0] = low
-        if high > k1:
-            _fill(sight, i, lattice, below, s, v, k1 + 1, high)
-            known[i, s, v, 1] = high
-
-
-@compiled
-def _fill(sight: Sight, i: int, lattice: Lattice, below: int, s: int, v: int, low: int, high: int) -> None:
-    """Shortfalls in a row's cells: where a solid's reach crosses it, the largest of all solids."""
-    near = sight.near
-    missing = sight.missing
-    for c in range(low, high + 1):
-        missing[i, s, v, c] = 0.0
-    up = sight.lanes[i, 1] + (v - below) * lattice.layer_m
-    lane = sight.lanes[i, 0]
-    for n in range(sight.here_count[i, s]):
-        entry = sight.here[i, s, n]
-        if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
-            continue
-        at = sight.along[i] + s * lattice.step_m
-        half_step = _half_step(near[i, entry, LOW], near[i, entry, HIGH], lattice.step_m)
-        if half_step > 0.0:
-            middle = 0.5 * (near[i, entry, LOW] + near[i, entry, HIGH])
-            at = min(max(middle, at - half_step), at + half_step)
-        left = near[i, entry, LOW + 1]
-        right = near[i, entry, HIGH + 1]
-        x = at - near[i, entry, ALONG]
-        z = near[i, entry, ROUND] * (up - near[i, entry, UP])
-        if near[i, entry, ROUND] >= 0.0:
-            across2 = near[i, entry, OUTER2] - x * x - z * z
-            if across2 < 0.0:
+            k0 = high + 1
+            k1 = high
+        first = min(low, k0)
+        last = max(high, k1)
+        known[i, s, v, 0] = first
+        known[i, s, v, 1] = last
+        for c in range(first, k0):
+            missing[i, s, v, c] = 0.0
+        for c in range(k1 + 1, last + 1):
+            missing[i, s, v, c] = 0.0
+        up = sight.lanes[i, 1] + (v - below) * lattice.layer_m
+        for n in range(sight.here_count[i, s]):
+            entry = sight.here[i, s, n]
+            if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
                 continue
-            across = math.sqrt(across2)
-            left = near[i, entry, LEFT] - across
-            right = near[i, entry, LEFT] + across
-        c0 = max(low, int(np.floor((left - lane) / lattice.cell_m)) + lattice.half)
-        c1 = min(high, int(np.ceil((right - lane) / lattice.cell_m)) + lattice.half)
-        if is_round(near, i, entry, up):
-            _fill_round(
-                missing, i, s, v, c0, c1, lane - lattice.half * lattice.cell_m - near[i, entry, LEFT],
-                lattice.cell_m, x, z, near[i, entry, RADIUS], near[i, entry, TOUCHED], sight.turned,
-                sight.k, sight.need_m,
-            )  # fmt: skip
-            continue
-        for c in range(c0, c1 + 1):
-            place = lane + (c - lattice.half) * lattice.cell_m
-            short = shortfall(
-                sight.solids, sight.found[i, entry], sight.frame, at, place, up, sight.covariance[i], sight.k,
-                sight.need_m,
-            )[0]  # fmt: skip
-            missing[i, s, v, c] = max(missing[i, s, v, c], short)
+            at = station
+            half_step = _half_step(near[i, entry, LOW], near[i, entry, HIGH], lattice.step_m)
+            if half_step > 0.0:
+                middle = 0.5 * (near[i, entry, LOW] + near[i, entry, HIGH])
+                at = min(max(middle, station - half_step), station + half_step)
+            x = at - near[i, entry, ALONG]
+            z = near[i, entry, ROUND] * (up - near[i, entry, UP])
+            if near[i, entry, ROUND] >= 0.0:
+                across2 = near[i, entry, OUTER2] - x * x - z * z
+                if across2 < 0.0:
+                    continue
+                across = math.sqrt(across2)
+                left = near[i, entry, LEFT] - across
+                right = near[i, entry, LEFT] + across
+            else:
+                left = near[i, entry, LOW + 1]
+                right = near[i, entry, HIGH + 1]
+            c0 = max(first, int(np.floor((left - lane) / cell)) + half)
+            c1 = min(last, int(np.ceil((right - lane) / cell)) + half)
+            if is_round(near, i, entry, up):
+                y0 = lane - half * cell - near[i, entry, LEFT]
+                for a, z1 in ((c0, min(c1, k0 - 1)), (max(c0, k1 + 1), c1)):
+                    if a <= z1:
+                        _fill_round(
+                            missing, i, s, v, a, z1, y0, cell, x, z, near[i, entry, RADIUS],
+                            near[i, entry, TOUCHED], sight.turned, sight.k, sight.need_m,
+                        )  # fmt: skip
+                continue
+            for c in range(c0, c1 + 1):
+                if k0 <= c <= k1:
+                    continue
+                place = lane + (c - half) * cell
+                short = shortfall(
+                    sight.solids, sight.found[i, entry], sight.frame, at, place, up, sight.covariance[i],
+                    sight.k, sight.need_m,
+                )[0]  # fmt: skip
+                missing[i, s, v, c] = max(missing[i, s, v, c], short)
 
 
 @compiled
@@ -243,8 +248,7 @@ def _fill_round(
     k: float,
     need_m: float,
 ) -> None:
-    if c1 < c0:
-        return
+    """Take a round solid into the shortfalls of a row's cells c0 ... c1; the first is y0 + c0 cells away."""
     k0 = turned[i, 0, 0] * x * x + turned[i, 2, 2] * z * z + 2.0 * turned[i, 0, 2] * x * z
     k1 = 2.0 * (turned[i, 0, 1] * x + turned[i, 1, 2] * z)
     k2 = turned[i, 1, 1]
@@ -373,7 +377,7 @@ def _place_price(
 ) -> float:
     total = _own_price(lattice, below, prices, query, bend, s, v, c)
     for i in range(query.first, query.stop):
-        if sight.count[i] > 0:
+        if sight.here_count[i, s] > 0:
             cover(sight, i, lattice, below, s, v, v, c, c)
             total += lattice.step_m * missing_price(sight.missing[i, s, v, c], prices)
     if s > 0 and query.stop - query.first == 1:
@@ -533,7 +537,7 @@ def _pay(
             c0 = min(c0, c)
             c1 = max(c1, c)
     for i in range(query.first, query.stop):
-        if sight.count[i] > 0:
+        if sight.here_count[i, s] > 0:
             cover(sight, i, lattice, below, s, v0, v1, c0, c1)
     missing = sight.missing
     window = (v0, v1, c0, c1)
@@ -549,7 +553,7 @@ def _pay(
                 continue
             own = bench.own[v, c]
             for i in range(query.first, query.stop):
-                if sight.count[i] > 0 and missing[i, s, v, c] > 0.0:
+                if sight.here_count[i, s] > 0 and missing[i, s, v, c] > 0.0:
                     own += step * missing_price(missing[i, s, v, c], prices)
             there += own
             if there + ahead * bench.bend[v, c] <= limit and alone and s > 0:
@@ -695,7 +699,7 @@ def cheapest_profile(
         )  # fmt: skip
     # Sums are rounded: a little above the price of a profile that is there.
     known += 1e-9 * known + 1e-9
-    limit = FIRST_GUESS * weight
+    limit = FIRST_GUESS * weight if layers > 1 else known
     while limit < 0.5 * known:
         price = search_within(
             sight, lattice, below, layers, prices, query, bench, edge, c, v, limit, profile

@@ -112,6 +112,8 @@ def _refine(coarse: Array, every: int, fine: Array) -> None:
 def _blocked(sight: Sight, i: int, lattice: Lattice, below: int) -> bool:
     """Whether anything is short on a UAV's lane."""
     for s in range(lattice.stations):
+        if sight.here_count[i, s] == 0:
+            continue
         cover(sight, i, lattice, below, s, below, below, lattice.half, lattice.half)
         if sight.missing[i, s, below, lattice.half] > 0.0:
             return True
@@ -131,6 +133,8 @@ def _tight(
     if c1 < c0:
         return False
     for s in range(int(np.ceil(TIGHT_M / lattice.step_m))):
+        if sight.here_count[i, s] == 0:
+            continue
         cover(sight, i, lattice, below, s, layer, layer, c0, c1)
         for c in range(c0, c1 + 1):
             if sight.missing[i, s, layer, c] > 0.0:
@@ -155,20 +159,20 @@ class Scratch(NamedTuple):
 
 
 @compiled
-def make_scratch(uavs: int, fine: int, search: Search) -> Scratch:
-    """Scratch for runs of so many UAVs, with room for both lattices."""
+def make_scratch(uavs: int, fine: int, most: int, search: Search) -> Scratch:
+    """Scratch for runs of so many UAVs that see so many solids each, with room for both lattices."""
     first = search.lattice
     wide = search.wide
     stations = max(first.stations, wide.stations)
     cells = 2 * max(first.half, wide.half) + 1
     layers = 1 + max(max(first.layers, first.sphere_layers), max(wide.layers, wide.sphere_layers))
     return Scratch(
-        np.empty((uavs, MOST_SOLIDS), dtype=np.int64),
+        np.empty((uavs, most), dtype=np.int64),
         np.empty(uavs, dtype=np.int64),
         np.empty(uavs),
         np.empty((uavs, 3, 3)),
-        np.empty((uavs, MOST_SOLIDS, COLUMNS)),
-        np.empty((uavs, stations, MOST_SOLIDS), dtype=np.int64),
+        np.empty((uavs, most, COLUMNS)),
+        np.empty((uavs, stations, most), dtype=np.int64),
         np.empty((uavs, stations), dtype=np.int64),
         np.empty((uavs, stations, layers, cells)),
         np.empty((uavs, stations, layers, 2), dtype=np.int64),
@@ -284,10 +288,10 @@ def plan_run(
         for s in range(fine):
             moved = moved or abs(last[i, s, 0]) > 1e-3 or abs(last[i, s, 1]) > 1e-3
     for i in range(uavs):
-        if count[i] == 0:
-            continue
         look(sight, boxes, i)
         list_here(sight, i, lattice)
+        if count[i] == 0:
+            continue
         blocked = _blocked(sight, i, lattice, below)
         is_short[i] = blocked or any_short(sight, i, lattice, below, layers)
         if is_short[i]:
@@ -389,7 +393,10 @@ def plan_all(
     busy: NDArray[np.bool_],
 ) -> None:
     """Plan all runs that are due, each from its own scene and state alone."""
-    scratch = make_scratch(profiles.shape[1], profiles.shape[2], search)
+    most = 1
+    for scene in range(len(scene_start) - 1):
+        most = max(most, min(scene_start[scene + 1] - scene_start[scene], MOST_SOLIDS))
+    scratch = make_scratch(profiles.shape[1], profiles.shape[2], most, search)
     for r in range(along.shape[0]):
         if not due[r]:
             continue
