@@ -166,13 +166,13 @@ def smooth_terms(profile: Array, mean: Array, last: Array, step_m: float, prices
 
 
 @compiled
-def add_row(band: Band, s: int, weight: float, g0: float, g1: float, wanted: float) -> None:
+def add_row(own: Array, right: Array, s: int, weight: float, g0: float, g1: float, wanted: float) -> None:
     """Add weight (wanted - g x_s)^2 of station s to a band system."""
-    band.own[s, 0] += weight * g0 * g0
-    band.own[s, 1] += weight * g1 * g1
-    band.own[s, 2] += weight * g0 * g1
-    band.right[s, 0] += weight * g0 * wanted
-    band.right[s, 1] += weight * g1 * wanted
+    own[s, 0] += weight * g0 * g0
+    own[s, 1] += weight * g1 * g1
+    own[s, 2] += weight * g0 * g1
+    right[s, 0] += weight * g0 * wanted
+    right[s, 1] += weight * g1 * wanted
 
 
 @compiled
@@ -184,25 +184,28 @@ def add_solids(
     Where the distance grows along the path only, as before a wall, its gradient does not tell which way to
     give: there the profile is drawn to its draft.
     """
-    near = sight.near
+    own, right = band.own, band.right
+    near, found = sight.near, sight.found
+    solids, frame, turned, covariance = sight.solids, sight.frame, sight.turned[i], sight.covariance[i]
+    k, need = sight.k, sight.need_m
+    lane, height, start = sight.lanes[i, 0], sight.lanes[i, 1], sight.along[i]
     stations = profile.shape[0]
     lowest = highest = profile[0, 0]
     for s in range(1, stations):
         lowest = min(lowest, profile[s, 0])
         highest = max(highest, profile[s, 0])
-    lowest += sight.lanes[i, 0]
-    highest += sight.lanes[i, 0]
-    covariance = sight.turned[i]
+    lowest += lane
+    highest += lane
     for entry in range(sight.count[i]):
         if lowest > near[i, entry, HIGH + 1] or highest < near[i, entry, LOW + 1]:
             continue
-        s0 = max(0, int(np.ceil((near[i, entry, LOW] - sight.along[i]) / step_m)))
-        s1 = min(stations - 1, int(np.floor((near[i, entry, HIGH] - sight.along[i]) / step_m)))
+        s0 = max(0, int(np.ceil((near[i, entry, LOW] - start) / step_m)))
+        s1 = min(stations - 1, int(np.floor((near[i, entry, HIGH] - start) / step_m)))
         ball = near[i, entry, ROUND]
         for s in range(s0, s1 + 1):
-            along = sight.along[i] + s * step_m
-            left = sight.lanes[i, 0] + profile[s, 0]
-            up = sight.lanes[i, 1] + profile[s, 1]
+            along = start + s * step_m
+            left = lane + profile[s, 0]
+            up = height + profile[s, 1]
             if left < near[i, entry, LOW + 1] or left > near[i, entry, HIGH + 1]:
                 continue
             if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
@@ -214,19 +217,18 @@ def add_solids(
                 continue
             if is_round(near, i, entry, up):
                 short, g0, g1 = round_shortfall(
-                    x, y, z, near[i, entry, RADIUS], near[i, entry, TOUCHED], covariance, sight.k, sight.need_m
+                    x, y, z, near[i, entry, RADIUS], near[i, entry, TOUCHED], turned, k, need
                 )
             else:
                 short, g0, g1 = shortfall(
-                    sight.solids, sight.found[i, entry], sight.frame, along, left, up, sight.covariance[i],
-                    sight.k, sight.need_m,
+                    solids, found[i, entry], frame, along, left, up, covariance, k, need
                 )  # fmt: skip
             if short > 0.0 and g0 * g0 + g1 * g1 < LEAST_ACROSS**2:
-                add_row(band, s, weight * step_m, 1.0, 0.0, draft[s, 0])
-                add_row(band, s, weight * step_m, 0.0, 1.0, draft[s, 1])
+                add_row(own, right, s, weight * step_m, 1.0, 0.0, draft[s, 0])
+                add_row(own, right, s, weight * step_m, 0.0, 1.0, draft[s, 1])
             elif short > 0.0:
                 wanted = short + g0 * profile[s, 0] + g1 * profile[s, 1]
-                add_row(band, s, weight * step_m, g0, g1, wanted)
+                add_row(own, right, s, weight * step_m, g0, g1, wanted)
 
 
 @compiled
@@ -244,6 +246,7 @@ def add_neighbour(
 
     ``along`` and ``lane`` (2,) are this UAV's place relative to the other's; each yields half.
     """
+    own, right = band.own, band.right
     for s in range(profile.shape[0]):
         d0 = lane[0] + profile[s, 0] - other[s, 0]
         d1 = lane[1] + profile[s, 1] - other[s, 1]
@@ -256,32 +259,34 @@ def add_neighbour(
             g0 = 1.0
         target = math.sqrt(max(separation * separation - along * along, 0.0)) - across
         wanted = 0.5 * target + g0 * profile[s, 0] + g1 * profile[s, 1]
-        add_row(band, s, weight * step_m, g0, g1, wanted)
+        add_row(own, right, s, weight * step_m, g0, g1, wanted)
 
 
 @compiled
 def exact_missing(sight: Sight, i: int, step_m: float, profile: Array, missing: Array) -> None:
     """Largest shortfall (station,) along a profile, 0 where nothing is short, in place."""
     missing[:] = 0.0
-    near = sight.near
+    near, found = sight.near, sight.found
+    solids, frame, turned, covariance = sight.solids, sight.frame, sight.turned[i], sight.covariance[i]
+    k, need = sight.k, sight.need_m
+    lane, height, start = sight.lanes[i, 0], sight.lanes[i, 1], sight.along[i]
     stations = profile.shape[0]
     lowest = highest = profile[0, 0]
     for s in range(1, stations):
         lowest = min(lowest, profile[s, 0])
         highest = max(highest, profile[s, 0])
-    lowest += sight.lanes[i, 0]
-    highest += sight.lanes[i, 0]
-    covariance = sight.turned[i]
+    lowest += lane
+    highest += lane
     for entry in range(sight.count[i]):
         if lowest > near[i, entry, HIGH + 1] or highest < near[i, entry, LOW + 1]:
             continue
-        s0 = max(0, int(np.ceil((near[i, entry, LOW] - sight.along[i]) / step_m)))
-        s1 = min(stations - 1, int(np.floor((near[i, entry, HIGH] - sight.along[i]) / step_m)))
+        s0 = max(0, int(np.ceil((near[i, entry, LOW] - start) / step_m)))
+        s1 = min(stations - 1, int(np.floor((near[i, entry, HIGH] - start) / step_m)))
         ball = near[i, entry, ROUND]
         for s in range(s0, s1 + 1):
-            along = sight.along[i] + s * step_m
-            left = sight.lanes[i, 0] + profile[s, 0]
-            up = sight.lanes[i, 1] + profile[s, 1]
+            along = start + s * step_m
+            left = lane + profile[s, 0]
+            up = height + profile[s, 1]
             if left < near[i, entry, LOW + 1] or left > near[i, entry, HIGH + 1]:
                 continue
             if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
@@ -293,12 +298,11 @@ def exact_missing(sight: Sight, i: int, step_m: float, profile: Array, missing: 
                 continue
             if is_round(near, i, entry, up):
                 short = round_shortfall(
-                    x, y, z, near[i, entry, RADIUS], near[i, entry, TOUCHED], covariance, sight.k, sight.need_m
+                    x, y, z, near[i, entry, RADIUS], near[i, entry, TOUCHED], turned, k, need
                 )[0]
             else:
                 short = shortfall(
-                    sight.solids, sight.found[i, entry], sight.frame, along, left, up, sight.covariance[i],
-                    sight.k, sight.need_m,
+                    solids, found[i, entry], frame, along, left, up, covariance, k, need
                 )[0]  # fmt: skip
             missing[s] = max(missing[s], short)
 

@@ -111,6 +111,7 @@ class Query(NamedTuple):
     last: Array  # (uav, fine station, 2)
     chosen: Array  # (uav, station, 2) profiles of the UAVs before the first, to keep apart from
     separation: Array  # (uav, uav)
+    crowded: bool  # whether any of those is near enough to matter
     aside: float  # price of a metre on the spot, negative if not possible
 
 
@@ -162,10 +163,13 @@ def cover(
 
     Only where a solid's reach crosses a row they are worked out; the largest of all solids counts.
     """
-    near = sight.near
-    missing = sight.missing
-    known = sight.known
+    near, found, here, turned = sight.near, sight.found, sight.here, sight.turned
+    missing, known = sight.missing, sight.known
+    solids, frame, covariance = sight.solids, sight.frame, sight.covariance
+    k, need = sight.k, sight.need_m
+    here_count = sight.here_count[i, s]
     lane = sight.lanes[i, 0]
+    height = sight.lanes[i, 1]
     cell = lattice.cell_m
     half = lattice.half
     station = sight.along[i] + s * lattice.step_m
@@ -186,9 +190,9 @@ def cover(
             missing[i, s, v, c] = 0.0
         for c in range(k1 + 1, last + 1):
             missing[i, s, v, c] = 0.0
-        up = sight.lanes[i, 1] + (v - below) * lattice.layer_m
-        for n in range(sight.here_count[i, s]):
-            entry = sight.here[i, s, n]
+        up = height + (v - below) * lattice.layer_m
+        for n in range(here_count):
+            entry = here[i, s, n]
             if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
                 continue
             at = station
@@ -216,17 +220,14 @@ def cover(
                     if a <= z1:
                         _fill_round(
                             missing, i, s, v, a, z1, y0, cell, x, z, near[i, entry, RADIUS],
-                            near[i, entry, TOUCHED], sight.turned, sight.k, sight.need_m,
+                            near[i, entry, TOUCHED], turned, k, need,
                         )  # fmt: skip
                 continue
             for c in range(c0, c1 + 1):
                 if k0 <= c <= k1:
                     continue
                 place = lane + (c - half) * cell
-                short = shortfall(
-                    sight.solids, sight.found[i, entry], sight.frame, at, place, up, sight.covariance[i],
-                    sight.k, sight.need_m,
-                )[0]  # fmt: skip
+                short = shortfall(solids, found[i, entry], frame, at, place, up, covariance[i], k, need)[0]
                 missing[i, s, v, c] = max(missing[i, s, v, c], short)
 
 
@@ -321,24 +322,15 @@ def price_ahead(lattice: Lattice, path: float, slope: float, ahead: Array) -> No
 
 @compiled
 def _own_price(
-    lattice: Lattice, below: int, prices: Prices, query: Query, bend: Array, s: int, v: int, c: int
-) -> float:
-    """Price of being at a place, a step's worth, without what is in the way."""
-    f = lattice.fine * s
-    # What lies far ahead may be thought over again; what is near has been decided.
-    keep = prices.keep * (1.0 - s / lattice.stations)
-    left = (c - lattice.half) * lattice.cell_m
-    up = (v - below) * lattice.layer_m
-    total = 0.0
-    for i in range(query.first, query.stop):
-        price = prices.path * bend[v, c]
-        if query.shape > 0.0:
-            square = (left - query.mean[f, 0]) ** 2 + (up - query.mean[f, 1]) ** 2
-            price += query.shape * bent(square, prices.far_m)
-        square = (left - query.last[i, f, 0]) ** 2 + (up - query.last[i, f, 1]) ** 2
-        price += keep * min(square, prices.keep_m * prices.keep_m)
-        total += lattice.step_m * price
-    return total
+    left: float, up: float, bend: float, mean: Array, last: Array, i: int, f: int, shape: float, keep: float,
+    prices: Prices,
+) -> float:  # fmt: skip
+    """What one UAV pays a metre for being at a place: offset, shape and hysteresis."""
+    price = prices.path * bend
+    if shape > 0.0:
+        price += shape * bent((left - mean[f, 0]) ** 2 + (up - mean[f, 1]) ** 2, prices.far_m)
+    square = (left - last[i, f, 0]) ** 2 + (up - last[i, f, 1]) ** 2
+    return price + keep * min(square, prices.keep_m * prices.keep_m)
 
 
 @compiled
@@ -364,28 +356,6 @@ def _apart_price(
 
 
 @compiled
-def _place_price(
-    sight: Sight,
-    lattice: Lattice,
-    below: int,
-    prices: Prices,
-    query: Query,
-    bend: Array,
-    s: int,
-    v: int,
-    c: int,
-) -> float:
-    total = _own_price(lattice, below, prices, query, bend, s, v, c)
-    for i in range(query.first, query.stop):
-        if sight.here_count[i, s] > 0:
-            cover(sight, i, lattice, below, s, v, v, c, c)
-            total += lattice.step_m * missing_price(sight.missing[i, s, v, c], prices)
-    if s > 0 and query.stop - query.first == 1:
-        total += _apart_price(sight, lattice, below, prices.apart, query, s, v, c)
-    return total
-
-
-@compiled
 def _edge_prices(lattice: Lattice, slope_price: float, steep_slope: float, edge: Array) -> None:
     """Prices (3, 2) of steps of so many cells and layers from one station to the next."""
     for dc in range(3):
@@ -403,42 +373,65 @@ def price_of(
     layers: int,
     prices: Prices,
     query: Query,
-    bend: Array,
+    bends: Array,
     edge: Array,
     start_cell: int,
     start_layer: int,
     wanted: Array,
-    every: int,
 ) -> float:
-    """Price of the lattice's profile from a place that follows a wanted one (station, 2) as steps allow."""
+    """Price of the lattice's profile that follows a wanted one (fine station, 2) as steps allow."""
+    mean, last = query.mean, query.last
+    here_count, missing, known = sight.here_count, sight.missing, sight.known
     c = start_cell
     v = start_layer
-    total = _place_price(sight, lattice, below, prices, query, bend, 0, v, c)
-    for s in range(1, lattice.stations):
-        to_c = round(wanted[every * s, 0] / lattice.cell_m) + lattice.half
-        to_v = round(wanted[every * s, 1] / lattice.layer_m) + below
-        dc = min(max(min(max(to_c, 0), 2 * lattice.half) - c, -2), 2)
-        dv = min(max(min(max(to_v, 0), layers - 1) - v, -1), 1)
-        c += dc
-        v += dv
-        total += edge[abs(dc), abs(dv)]
-        total += _place_price(sight, lattice, below, prices, query, bend, s, v, c)
+    total = 0.0
+    for s in range(lattice.stations):
+        f = lattice.fine * s
+        if s > 0:
+            to_c = round(wanted[f, 0] / lattice.cell_m) + lattice.half
+            to_v = round(wanted[f, 1] / lattice.layer_m) + below
+            dc = min(max(min(max(to_c, 0), 2 * lattice.half) - c, -2), 2)
+            dv = min(max(min(max(to_v, 0), layers - 1) - v, -1), 1)
+            c += dc
+            v += dv
+            total += edge[abs(dc), abs(dv)]
+        keep = prices.keep * (1.0 - s / lattice.stations)
+        left = (c - lattice.half) * lattice.cell_m
+        up = (v - below) * lattice.layer_m
+        for i in range(query.first, query.stop):
+            price = _own_price(left, up, bends[v, c], mean, last, i, f, query.shape, keep, prices)
+            total += lattice.step_m * price
+            if here_count[i, s] > 0:
+                if c < known[i, s, v, 0] or c > known[i, s, v, 1]:
+                    cover(sight, i, lattice, below, s, v, v, c, c)
+                total += lattice.step_m * missing_price(missing[i, s, v, c], prices)
+        if query.crowded and s > 0:
+            total += _apart_price(sight, lattice, below, prices.apart, query, s, v, c)
     return total
 
 
 @compiled
-def _spread(value: Array, layers: int, cells: int, cell: int, layer: int, per_cell: float, per_layer: float) -> None:
+def _spread(
+    value: Array,
+    lowest: int,
+    highest: int,
+    cells: int,
+    cell: int,
+    layer: int,
+    per_cell: float,
+    per_layer: float,
+) -> None:
     """Prices of getting to each place on the spot, from places' own: straight up or down first, then aside.
 
     Every place on the way is paid for, so that what stands beside a UAV is not stepped through.
     """
     h = HALO
     b = LAYER_HALO
-    for v in range(layer + 1, layers):
+    for v in range(layer + 1, highest + 1):
         value[b + v, h + cell] += value[b + v - 1, h + cell] + per_layer
-    for v in range(layer - 1, -1, -1):
+    for v in range(layer - 1, lowest - 1, -1):
         value[b + v, h + cell] += value[b + v + 1, h + cell] + per_layer
-    for v in range(layers):
+    for v in range(lowest, highest + 1):
         for c in range(cell + 1, cells):
             value[b + v, h + c] += value[b + v, h + c - 1] + per_cell
         for c in range(cell - 1, -1, -1):
@@ -471,13 +464,15 @@ def _relax(value: Array, s: int, v: int, low: int, high: int, edge: Array) -> No
         x = min(min(value[b, level, p], value[b, level, q]) + e10, x)
         x = min(min(value[b, under, c], value[b, over, c]) + e01, x)
         x = min(
-            min(min(value[b, under, p], value[b, under, q]), min(value[b, over, p], value[b, over, q])) + e11, x
+            min(min(value[b, under, p], value[b, under, q]), min(value[b, over, p], value[b, over, q])) + e11,
+            x,
         )
         p = c - two
         q = c + two
         x = min(min(value[b, level, p], value[b, level, q]) + e20, x)
         x = min(
-            min(min(value[b, under, p], value[b, under, q]), min(value[b, over, p], value[b, over, q])) + e21, x
+            min(min(value[b, under, p], value[b, under, q]), min(value[b, over, p], value[b, over, q])) + e21,
+            x,
         )
         value[to, level, c] = x
 
@@ -499,66 +494,74 @@ def _pay(
 
     Returns the smallest window (first and last layer, first and last cell) around what is left.
     """
-    value = bench.value
+    value, owns, bends = bench.value, bench.own, bench.bend
+    mean, last = query.mean, query.last
+    here_count, missing, known = sight.here_count, sight.missing, sight.known
     ahead = weight * bench.ahead[s]
     step = lattice.step_m
     least = weight * step * prices.path + ahead
     f = lattice.fine * s
     # What lies far ahead may be thought over again; what is near has been decided.
     keep = prices.keep * (1.0 - s / lattice.stations)
-    kept = prices.keep_m * prices.keep_m
-    v0 = window[1] + 1
-    v1 = window[0] - 1
-    c0 = window[3] + 1
-    c1 = window[2] - 1
-    for v in range(window[0], window[1] + 1):
+    v_low, v_high, c_low, c_high = window
+    v0 = v_high + 1
+    v1 = v_low - 1
+    c0 = c_high + 1
+    c1 = c_low - 1
+    for v in range(v_low, v_high + 1):
         up = (v - below) * lattice.layer_m
-        for c in range(window[2], window[3] + 1):
+        for c in range(c_low, c_high + 1):
             there = value[s, LAYER_HALO + v, HALO + c]
-            bend = bench.bend[v, c]
-            if there + least * bend > limit:
+            bend = bends[v, c]
+            if not there + least * bend <= limit:
                 value[s, LAYER_HALO + v, HALO + c] = np.inf
                 continue
             left = (c - lattice.half) * lattice.cell_m
             own = 0.0
             for i in range(query.first, query.stop):
-                price = prices.path * bend
-                if query.shape > 0.0:
-                    square = (left - query.mean[f, 0]) ** 2 + (up - query.mean[f, 1]) ** 2
-                    price += query.shape * bent(square, prices.far_m)
-                square = (left - query.last[i, f, 0]) ** 2 + (up - query.last[i, f, 1]) ** 2
-                own += step * (price + keep * min(square, kept))
+                own += step * _own_price(left, up, bend, mean, last, i, f, query.shape, keep, prices)
             if there + own + ahead * bend > limit:
                 value[s, LAYER_HALO + v, HALO + c] = np.inf
                 continue
-            bench.own[v, c] = own
+            owns[v, c] = own
             v0 = min(v0, v)
             v1 = v
             c0 = min(c0, c)
             c1 = max(c1, c)
+    anything = query.crowded and s > 0
     for i in range(query.first, query.stop):
-        if sight.here_count[i, s] > 0:
-            cover(sight, i, lattice, below, s, v0, v1, c0, c1)
-    missing = sight.missing
-    window = (v0, v1, c0, c1)
-    v0 = window[1] + 1
-    v1 = window[0] - 1
-    c0 = window[3] + 1
-    c1 = window[2] - 1
-    alone = query.stop - query.first == 1
-    for v in range(window[0], window[1] + 1):
-        for c in range(window[2], window[3] + 1):
+        if here_count[i, s] == 0:
+            continue
+        anything = True
+        for v in range(v0, v1 + 1):
+            if c0 < known[i, s, v, 0] or c1 > known[i, s, v, 1]:
+                cover(sight, i, lattice, below, s, v, v1, c0, c1)
+                break
+    if not anything:
+        for v in range(v0, v1 + 1):
+            for c in range(c0, c1 + 1):
+                if value[s, LAYER_HALO + v, HALO + c] < np.inf:
+                    value[s, LAYER_HALO + v, HALO + c] += owns[v, c]
+        return v0, v1, c0, c1
+    v_low, v_high, c_low, c_high = v0, v1, c0, c1
+    v0 = v_high + 1
+    v1 = v_low - 1
+    c0 = c_high + 1
+    c1 = c_low - 1
+    for v in range(v_low, v_high + 1):
+        for c in range(c_low, c_high + 1):
             there = value[s, LAYER_HALO + v, HALO + c]
             if not there < np.inf:
                 continue
-            own = bench.own[v, c]
+            own = owns[v, c]
             for i in range(query.first, query.stop):
-                if sight.here_count[i, s] > 0 and missing[i, s, v, c] > 0.0:
+                if here_count[i, s] > 0 and missing[i, s, v, c] > 0.0:
                     own += step * missing_price(missing[i, s, v, c], prices)
             there += own
-            if there + ahead * bench.bend[v, c] <= limit and alone and s > 0:
+            rest = ahead * bends[v, c]
+            if query.crowded and s > 0 and there + rest <= limit:
                 there += _apart_price(sight, lattice, below, prices.apart, query, s, v, c)
-            if there + ahead * bench.bend[v, c] > limit:
+            if there + rest > limit:
                 value[s, LAYER_HALO + v, HALO + c] = np.inf
                 continue
             value[s, LAYER_HALO + v, HALO + c] = there
@@ -574,7 +577,8 @@ def search_within(
     sight: Sight,
     lattice: Lattice,
     below: int,
-    layers: int,
+    lowest: int,
+    highest: int,
     prices: Prices,
     query: Query,
     bench: Bench,
@@ -586,14 +590,14 @@ def search_within(
 ) -> float:
     """Cheapest profile from a place at station 0 if it costs no more than a limit, else infinity.
 
-    Steps of up to two cells and one layer a station; on the spot any number if ``query.aside`` is not
+    It keeps to the layers lowest ... highest. Steps of up to two cells and one layer a station; on the spot any number if ``query.aside`` is not
     negative. The profile (station, 2) gets offsets to the left and up [m]. Returns its price.
     """
     cells = 2 * lattice.half + 1
     weight = float(query.stop - query.first)
     value = bench.value
     if query.aside >= 0.0:
-        window = (0, layers - 1, 0, cells - 1)
+        window = (lowest, highest, 0, cells - 1)
     else:
         window = (start_layer, start_layer, start_cell, start_cell)
     _clear(value, 0, window)
@@ -604,13 +608,20 @@ def search_within(
     if query.aside >= 0.0:
         aside = weight * query.aside
         _spread(
-            value[0], layers, cells, start_cell, start_layer, aside * lattice.cell_m, aside * lattice.layer_m
+            value[0],
+            lowest,
+            highest,
+            cells,
+            start_cell,
+            start_layer,
+            aside * lattice.cell_m,
+            aside * lattice.layer_m,
         )
     for s in range(1, lattice.stations):
         if window[1] < window[0]:
             return np.inf
         window = (
-            max(0, window[0] - 1), min(layers - 1, window[1] + 1),
+            max(lowest, window[0] - 1), min(highest, window[1] + 1),
             max(0, window[2] - 2), min(cells - 1, window[3] + 2),
         )  # fmt: skip
         _clear(value, s, window)
@@ -644,7 +655,9 @@ def _clear(value: Array, s: int, window: tuple[int, int, int, int]) -> None:
 
 
 @compiled
-def _trace(value: Array, lattice: Lattice, below: int, edge: Array, cell: int, layer: int, profile: Array) -> None:
+def _trace(
+    value: Array, lattice: Lattice, below: int, edge: Array, cell: int, layer: int, profile: Array
+) -> None:
     """Write the profile that ends in a place: back from station to station the way that was cheapest."""
     c = cell
     v = layer
@@ -688,23 +701,24 @@ def cheapest_profile(
     v = min(max(round(offset[1] / lattice.layer_m) + below, 0), layers - 1)
     edge = np.empty((3, 2))
     _edge_prices(lattice, weight * prices.slope, prices.steep, edge)
-    known = np.inf
-    for i in range(query.first, query.stop):
-        known = min(
-            known,
-            price_of(
-                sight, lattice, below, layers, prices, query, bench.bend, edge, c, v, query.last[i],
-                lattice.fine,
-            ),
-        )  # fmt: skip
+    # What was flown last is a way as well, or near to one.
+    wanted = query.last[query.first] if query.stop - query.first == 1 else query.mean
+    known = price_of(sight, lattice, below, layers, prices, query, bench.bend, edge, c, v, wanted)
     # Sums are rounded: a little above the price of a profile that is there.
     known += 1e-9 * known + 1e-9
+    if layers > 1 and v == below and known > FIRST_GUESS * weight:
+        level = search_within(
+            sight, lattice, below, below, below, prices, query, bench, edge, c, v, known, profile
+        )
+        known = min(known, level + 1e-9 * level)
     limit = FIRST_GUESS * weight if layers > 1 else known
     while limit < 0.5 * known:
         price = search_within(
-            sight, lattice, below, layers, prices, query, bench, edge, c, v, limit, profile
+            sight, lattice, below, 0, layers - 1, prices, query, bench, edge, c, v, limit, profile
         )
         if price < np.inf:
             return price
         limit *= 4.0
-    return search_within(sight, lattice, below, layers, prices, query, bench, edge, c, v, known, profile)
+    return search_within(
+        sight, lattice, below, 0, layers - 1, prices, query, bench, edge, c, v, known, profile
+    )

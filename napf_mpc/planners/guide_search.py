@@ -325,12 +325,15 @@ def plan_run(
             middle = np.zeros(2)
             for i in range(uavs):
                 middle += offset[i] / uavs
-            query = Query(0, uavs, 0.0, mean, last, coarse, separation, aside)
+            query = Query(0, uavs, 0.0, mean, last, coarse, separation, False, aside)
             cheapest_profile(sight, lattice, below, layers, prices, query, bench, middle, coarse[0])
             _refine(coarse[0], lattice.fine, draft_mean)
         for i in range(uavs):
             if away[i]:
-                query = Query(i, i + 1, prices.shape, draft_mean, last, coarse, separation, aside)
+                crowded = False
+                for j in range(i):
+                    crowded = crowded or abs(along[i] - along[j]) < separation[i, j]
+                query = Query(i, i + 1, prices.shape, draft_mean, last, coarse, separation, crowded, aside)
                 cheapest_profile(sight, lattice, below, layers, prices, query, bench, offset[i], coarse[i])
                 _refine(coarse[i], lattice.fine, trial[i])
                 for a in range(2):
@@ -346,8 +349,8 @@ def plan_run(
             for i in range(uavs):
                 smooth_terms(trial[i], draft_mean, last[i], step, prices, band)
                 if tight[i]:
-                    add_row(band, 0, prices.start, 1.0, 0.0, start[i, 0])
-                    add_row(band, 0, prices.start, 0.0, 1.0, start[i, 1])
+                    add_row(band.own, band.right, 0, prices.start, 1.0, 0.0, start[i, 0])
+                    add_row(band.own, band.right, 0, prices.start, 0.0, 1.0, start[i, 1])
                 if is_short[i]:
                     add_solids(sight, i, step, PUSH, drafts[i], trial[i], band)
                 for j in range(uavs):
