@@ -196,7 +196,7 @@ def add_solids(
         highest = max(highest, profile[s, 0])
     lowest += lane
     highest += lane
-    for entry in range(sight.count[i]):
+    for entry in range(sight.solid_count[i]):
         if lowest > near[i, entry, HIGH + 1] or highest < near[i, entry, LOW + 1]:
             continue
         s0 = max(0, int(np.ceil((near[i, entry, LOW] - start) / step_m)))
@@ -277,7 +277,7 @@ def exact_missing(sight: Sight, i: int, step_m: float, profile: Array, missing: 
         highest = max(highest, profile[s, 0])
     lowest += lane
     highest += lane
-    for entry in range(sight.count[i]):
+    for entry in range(sight.solid_count[i]):
         if lowest > near[i, entry, HIGH + 1] or highest < near[i, entry, LOW + 1]:
             continue
         s0 = max(0, int(np.ceil((near[i, entry, LOW] - start) / step_m)))

@@ -80,7 +80,7 @@ class Sight(NamedTuple):
     turned: Array  # (uav, 3, 3) the same in path coordinates
     reach: Array  # (uav,)
     found: NDArray[np.int64]  # (uav, most) solids
-    count: NDArray[np.int64]  # (uav,) their number
+    solid_count: NDArray[np.int64]  # (uav,) their number
     near: Array  # (uav, most, COLUMNS)
     here: NDArray[np.int64]  # (uav, station, most) which of the found ones reach a station
     here_count: NDArray[np.int64]  # (uav, station)
@@ -112,8 +112,8 @@ def round_shortfall(
 def is_round(near: Array, i: int, entry: int, up: float) -> bool:
     """Whether only the distance from a centre or axis counts at a height: a sphere, or well below a lid."""
     if near[i, entry, ROUND] != 0.0:
-        return near[i, entry, ROUND] > 0.0
-    return min(near[i, entry, LID] - up, up - near[i, entry, BOTTOM]) >= near[i, entry, RADIUS]
+        return bool(near[i, entry, ROUND] > 0.0)
+    return bool(min(near[i, entry, LID] - up, up - near[i, entry, BOTTOM]) >= near[i, entry, RADIUS])
 
 
 @compiled
@@ -130,7 +130,7 @@ def look(sight: Sight, boxes: SolidBoxes, i: int) -> None:
             sight.turned[i, a, b] = total
     level = ax[0, 2] == 0.0 and ax[1, 2] == 0.0 and ax[2, 2] > 0.0
     reach = sight.reach[i]
-    for entry in range(sight.count[i]):
+    for entry in range(sight.solid_count[i]):
         solid = sight.found[i, entry]
         row = sight.near[i, entry]
         given = sight.solids.parameters[solid]

@@ -4,8 +4,8 @@ Stations lie ahead of a UAV along the path; at each it may be in one of some lat
 layers. The cheapest profile is exact on that lattice, so there is no local minimum in which a wall, a U or
 an obstacle met head-on could hold it.
 
-It is found without looking at most of the lattice: a place is left out if what leads to it, and the least that
-must follow, cost more than a profile that is known, or than a guess that is raised until one is found.
+It is found without looking at most of the lattice: a place is left out if what leads to it, and the least
+that must follow, cost more than a profile that is known, or than a guess that is raised until one is found.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from napf_mpc.planners.guide_clearance import (
     UP,
     Sight,
     is_round,
-    round_shortfall,
     shortfall,
 )
 
@@ -130,7 +129,7 @@ def list_here(sight: Sight, i: int, lattice: Lattice) -> None:
     near = sight.near
     for s in range(lattice.stations):
         sight.here_count[i, s] = 0
-    for entry in range(sight.count[i]):
+    for entry in range(sight.solid_count[i]):
         half_step = _half_step(near[i, entry, LOW], near[i, entry, HIGH], lattice.step_m)
         low = near[i, entry, LOW] - half_step - sight.along[i]
         high = near[i, entry, HIGH] + half_step - sight.along[i]
@@ -274,7 +273,7 @@ def any_short(sight: Sight, i: int, lattice: Lattice, below: int, layers: int) -
     cells = 2 * lattice.half + 1
     # What is short anywhere is so next to the middle of a solid, most times.
     near = sight.near
-    for entry in range(sight.count[i]):
+    for entry in range(sight.solid_count[i]):
         along = 0.5 * (near[i, entry, LOW] + near[i, entry, HIGH]) - sight.along[i]
         left = 0.5 * (near[i, entry, LOW + 1] + near[i, entry, HIGH + 1]) - sight.lanes[i, 0]
         s = round(along / lattice.step_m)
@@ -330,7 +329,7 @@ def _own_price(
     if shape > 0.0:
         price += shape * bent((left - mean[f, 0]) ** 2 + (up - mean[f, 1]) ** 2, prices.far_m)
     square = (left - last[i, f, 0]) ** 2 + (up - last[i, f, 1]) ** 2
-    return price + keep * min(square, prices.keep_m * prices.keep_m)
+    return float(price + keep * min(square, prices.keep_m * prices.keep_m))
 
 
 @compiled
@@ -439,8 +438,21 @@ def _spread(
 
 
 @compiled
-def _relax(value: Array, s: int, v: int, low: int, high: int, edge: Array) -> None:
-    """Cheapest prices of getting to a row's cells low ... high from the station before, without their own."""
+def _relax(
+    value: Array,
+    bends: Array,
+    s: int,
+    v: int,
+    low: int,
+    high: int,
+    edge: Array,
+    least: float,
+    limit: float,
+) -> None:
+    """Cheapest prices of getting to a row's cells low ... high from the station before, without their own.
+
+    Infinite where that and ``least`` for the squared offset are beyond the limit.
+    """
     e00 = edge[0, 0]
     e10 = edge[1, 0]
     e20 = edge[2, 0]
@@ -456,6 +468,8 @@ def _relax(value: Array, s: int, v: int, low: int, high: int, edge: Array) -> No
     under = level - one
     over = level + one
     first = np.uint64(HALO + low)
+    layer = np.uint64(v)
+    column = np.uint64(low)
     for k in range(np.uint64(high - low + 1)):
         c = first + k
         p = c - one
@@ -474,7 +488,7 @@ def _relax(value: Array, s: int, v: int, low: int, high: int, edge: Array) -> No
             min(min(value[b, under, p], value[b, under, q]), min(value[b, over, p], value[b, over, q])) + e21,
             x,
         )
-        value[to, level, c] = x
+        value[to, level, c] = x if x + least * bends[layer, column + k] <= limit else np.inf
 
 
 @compiled
@@ -499,7 +513,6 @@ def _pay(
     here_count, missing, known = sight.here_count, sight.missing, sight.known
     ahead = weight * bench.ahead[s]
     step = lattice.step_m
-    least = weight * step * prices.path + ahead
     f = lattice.fine * s
     # What lies far ahead may be thought over again; what is near has been decided.
     keep = prices.keep * (1.0 - s / lattice.stations)
@@ -512,10 +525,9 @@ def _pay(
         up = (v - below) * lattice.layer_m
         for c in range(c_low, c_high + 1):
             there = value[s, LAYER_HALO + v, HALO + c]
-            bend = bends[v, c]
-            if not there + least * bend <= limit:
-                value[s, LAYER_HALO + v, HALO + c] = np.inf
+            if not there < np.inf:
                 continue
+            bend = bends[v, c]
             left = (c - lattice.half) * lattice.cell_m
             own = 0.0
             for i in range(query.first, query.stop):
@@ -590,8 +602,9 @@ def search_within(
 ) -> float:
     """Cheapest profile from a place at station 0 if it costs no more than a limit, else infinity.
 
-    It keeps to the layers lowest ... highest. Steps of up to two cells and one layer a station; on the spot any number if ``query.aside`` is not
-    negative. The profile (station, 2) gets offsets to the left and up [m]. Returns its price.
+    It keeps to the layers lowest ... highest. Steps of up to two cells and one layer a station; on the spot
+    any number if ``query.aside`` is not negative. The profile (station, 2) gets offsets to the left and up
+    [m]. Returns its price.
     """
     cells = 2 * lattice.half + 1
     weight = float(query.stop - query.first)
@@ -625,8 +638,9 @@ def search_within(
             max(0, window[2] - 2), min(cells - 1, window[3] + 2),
         )  # fmt: skip
         _clear(value, s, window)
+        least = weight * (lattice.step_m * prices.path + bench.ahead[s])
         for v in range(window[0], window[1] + 1):
-            _relax(value, s, v, window[2], window[3], edge)
+            _relax(value, bench.bend, s, v, window[2], window[3], edge, least, limit)
         window = _pay(sight, lattice, below, prices, query, bench, s, window, weight, limit)
     best = np.inf
     c_end = start_cell

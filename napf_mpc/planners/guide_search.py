@@ -146,7 +146,7 @@ class Scratch(NamedTuple):
     """What planning one run after the other writes over."""
 
     found: NDArray[np.int64]
-    count: NDArray[np.int64]
+    solid_count: NDArray[np.int64]
     reach: Array
     turned: Array
     near: Array
@@ -255,7 +255,7 @@ def plan_run(
     step = lattice.step_m / lattice.fine
     span = lattice.half * lattice.cell_m
     ahead = (lattice.stations - 1) * lattice.step_m
-    found, count, reach = scratch.found, scratch.count, scratch.reach
+    found, count, reach = scratch.found, scratch.solid_count, scratch.reach
     upwards = False
     downwards = True
     for i in range(uavs):
