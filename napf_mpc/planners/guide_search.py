@@ -7,6 +7,7 @@ one is kept: a lone obstacle moves one UAV, a wall moves all.
 
 from __future__ import annotations
 
+import threading
 from typing import NamedTuple
 
 import numpy as np
@@ -158,7 +159,6 @@ class Scratch(NamedTuple):
     band: Band
 
 
-@compiled
 def make_scratch(uavs: int, fine: int, most: int, search: Search) -> Scratch:
     """Scratch for runs of so many UAVs that see so many solids each, with room for both lattices."""
     first = search.lattice
@@ -377,6 +377,53 @@ def plan_run(
 
 
 @compiled
+def _plan_runs(
+    solids: Solids,
+    boxes: SolidBoxes,
+    scene_start: NDArray[np.int64],
+    frame: Frame,
+    due: NDArray[np.bool_],
+    along: Array,
+    offset: Array,
+    lanes: Array,
+    covariance: Array,
+    separation: Array,
+    last: Array,
+    stuck: NDArray[np.bool_],
+    search: Search,
+    profiles: Array,
+    missing: Array,
+    busy: NDArray[np.bool_],
+    scratch: Scratch,
+) -> None:
+    for r in range(along.shape[0]):
+        if not due[r]:
+            continue
+        scene = 0 if len(scene_start) == 2 else r
+        busy[r] = plan_run(
+            solids, boxes, scene_start[scene], scene_start[scene + 1], frame, along[r], offset[r], lanes,
+            covariance[r], separation[r], last[r], stuck[r], search, profiles[r], missing[r], scratch,
+        )  # fmt: skip
+
+
+class _Kept(threading.local):
+    """Scratch of this thread, kept from plan to plan: fresh memory would cost as much as the plan."""
+
+    def __init__(self) -> None:
+        self.key: tuple[object, ...] = ()
+        self.scratch: Scratch | None = None
+
+    def of(self, uavs: int, fine: int, most: int, search: Search) -> Scratch:
+        key = (uavs, fine, most, search.lattice, search.wide)
+        if self.scratch is None or key != self.key:
+            self.scratch = make_scratch(uavs, fine, most, search)
+            self.key = key
+        return self.scratch
+
+
+_KEPT = _Kept()
+
+
 def plan_all(
     solids: Solids,
     boxes: SolidBoxes,
@@ -395,19 +442,14 @@ def plan_all(
     missing: Array,
     busy: NDArray[np.bool_],
 ) -> None:
-    """Plan all runs that are due, each from its own scene and state alone."""
-    most = 1
-    for scene in range(len(scene_start) - 1):
-        most = max(most, min(scene_start[scene + 1] - scene_start[scene], MOST_SOLIDS))
-    scratch = make_scratch(profiles.shape[1], profiles.shape[2], most, search)
-    for r in range(along.shape[0]):
-        if not due[r]:
-            continue
-        scene = 0 if len(scene_start) == 2 else r
-        busy[r] = plan_run(
-            solids, boxes, scene_start[scene], scene_start[scene + 1], frame, along[r], offset[r], lanes,
-            covariance[r], separation[r], last[r], stuck[r], search, profiles[r], missing[r], scratch,
-        )  # fmt: skip
+    """Plan all runs that are due, each from its own scene and state alone; see :func:`plan_run`."""
+    largest = int(np.diff(scene_start).max(initial=0))
+    # Powers of two, so that scenes of different size share scratch.
+    most = min(MOST_SOLIDS, 1 << max(largest - 1, 1).bit_length())
+    _plan_runs(
+        solids, boxes, scene_start, frame, due, along, offset, lanes, covariance, separation, last, stuck,
+        search, profiles, missing, busy, _KEPT.of(profiles.shape[1], profiles.shape[2], most, search),
+    )  # fmt: skip
 
 
 @compiled
