@@ -6,132 +6,229 @@ matrix over the stations, so a pass costs a few microseconds.
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
-from napf_mpc.planners.guide_clearance import Frame, SolidBoxes, shortfall
+from napf_mpc.planners.guide_clearance import (
+    ALONG,
+    HIGH,
+    LEFT,
+    LOW,
+    OUTER2,
+    RADIUS,
+    ROUND,
+    TOUCHED,
+    UP,
+    Sight,
+    is_round,
+    round_shortfall,
+    shortfall,
+)
 from napf_mpc.planners.guide_lattice import Prices, bent, missing_price, steep
-from napf_mpc.world.distance import Solids
 
 Array = NDArray[np.float64]
 
-WIDTH = 6
-"""Diagonal and five bands below it: three stations of two offsets."""
 LEAST_ACROSS = 0.3
 """Part of a unit gradient that must lie across the path for a push along it."""
 
 
-@compiled
-def solve_band(matrix: Array, right: Array, n: int) -> None:
-    """Solve a positive definite band system in place: ``matrix[j, d]`` holds row j, column j - d."""
-    for j in range(n):
-        first = max(0, j - WIDTH + 1)
-        for c in range(first, j):
-            total = matrix[j, j - c]
-            for m in range(max(first, c - WIDTH + 1), c):
-                total -= matrix[j, j - m] * matrix[c, c - m] * matrix[m, 0]
-            matrix[j, j - c] = total / matrix[c, 0]
-        for c in range(first, j):
-            matrix[j, 0] -= matrix[j, j - c] * matrix[j, j - c] * matrix[c, 0]
-        for c in range(first, j):
-            right[j] -= matrix[j, j - c] * right[c]
-    for j in range(n):
-        right[j] /= matrix[j, 0]
-    for j in range(n - 1, -1, -1):
-        for c in range(j + 1, min(n, j + WIDTH)):
-            right[j] -= matrix[c, c - j] * right[c]
+class Band(NamedTuple):
+    """Positive definite system over stations of two offsets, each coupled with the two before."""
+
+    own: Array  # (station, 3) of a station's block: left, up, between them
+    one: Array  # (station,) to the station before, the same for left and up
+    two: Array  # (station,) to the one before that
+    right: Array  # (station, 2) right-hand side; the solution when solved
+    inverse: Array  # (station, 3) scratch: inverses of the factor's diagonal blocks
+    lower: Array  # (station, 4) scratch: the factor's blocks below them, row by row
+
+
+def empty_band(stations: int) -> Band:
+    """System of zeros."""
+    return Band(
+        np.zeros((stations, 3)),
+        np.zeros(stations),
+        np.zeros(stations),
+        np.zeros((stations, 2)),
+        np.zeros((stations, 3)),
+        np.zeros((stations, 4)),
+    )
 
 
 @compiled
-def smooth_terms(
-    profile: Array, mean: Array, last: Array, step_m: float, prices: Prices, matrix: Array, right: Array
-) -> None:
-    """Band system of path, shape, slope, change of slope and hysteresis, written anew."""
-    stations = profile.shape[0]
-    matrix[:] = 0.0
-    bend = prices.bend / step_m**3
+def solve_band(band: Band) -> None:
+    """Solve a band system in place, by the block LDL^T factors."""
+    own, one, two, right, inverse, lower = band
+    stations = len(one)
+    # Blocks of station s - 2 and s - 1: inverse diagonal p and q, the factor's block between them l.
+    p0 = p1 = px = q0 = q1 = qx = 0.0
+    l00 = l01 = l10 = l11 = 0.0
+    y0 = y1 = z0 = z1 = 0.0
     for s in range(stations):
-        size = np.sqrt(profile[s, 0] ** 2 + profile[s, 1] ** 2)
-        slope = prices.slope / step_m
-        if s > 0:
-            rise = np.sqrt(
-                (profile[s, 0] - profile[s - 1, 0]) ** 2 + (profile[s, 1] - profile[s - 1, 1]) ** 2
-            )
-            slope *= steep(rise / step_m, prices.steep)
-        path = prices.path * min(1.0, prices.far_m / max(size, 1e-9))
-        for a in range(2):
-            j = 2 * s + a
-            matrix[j, 0] += step_m * (path + prices.shape + prices.keep)
-            right[j] = step_m * (prices.shape * mean[s, a] + prices.keep * last[s, a])
-            if s > 0:
-                matrix[j, 0] += slope
-                matrix[j - 2, 0] += slope
-                matrix[j, 2] -= slope
-            if s > 1:
-                matrix[j, 0] += bend
-                matrix[j - 2, 0] += 4.0 * bend
-                matrix[j - 4, 0] += bend
-                matrix[j, 2] -= 2.0 * bend
-                matrix[j - 2, 2] -= 2.0 * bend
-                matrix[j, 4] += bend
+        f = two[s]
+        # Row s of L D: f I two back, and this one back.
+        w00 = one[s] - f * l00
+        w01 = -f * l10
+        w10 = -f * l01
+        w11 = one[s] - f * l11
+        l00 = w00 * q0 + w01 * qx
+        l01 = w00 * qx + w01 * q1
+        l10 = w10 * q0 + w11 * qx
+        l11 = w10 * qx + w11 * q1
+        d0 = own[s, 0] - f * f * p0 - (w00 * l00 + w01 * l01)
+        d1 = own[s, 1] - f * f * p1 - (w10 * l10 + w11 * l11)
+        dx = own[s, 2] - f * f * px - (w00 * l10 + w01 * l11)
+        r0 = right[s, 0] - f * (p0 * y0 + px * y1) - (l00 * z0 + l01 * z1)
+        r1 = right[s, 1] - f * (px * y0 + p1 * y1) - (l10 * z0 + l11 * z1)
+        p0 = q0
+        p1 = q1
+        px = qx
+        scale = 1.0 / (d0 * d1 - dx * dx)
+        q0 = d1 * scale
+        q1 = d0 * scale
+        qx = -dx * scale
+        y0 = z0
+        y1 = z1
+        z0 = r0
+        z1 = r1
+        right[s, 0] = r0
+        right[s, 1] = r1
+        inverse[s, 0] = q0
+        inverse[s, 1] = q1
+        inverse[s, 2] = qx
+        lower[s, 0] = l00
+        lower[s, 1] = l01
+        lower[s, 2] = l10
+        lower[s, 3] = l11
+    # L^T x = D^-1 y, from the end: u one station on, v two.
+    u0 = u1 = v0 = v1 = 0.0
+    for s in range(stations - 1, -1, -1):
+        t0 = right[s, 0]
+        t1 = right[s, 1]
+        if s + 2 < stations:
+            t0 -= two[s + 2] * v0
+            t1 -= two[s + 2] * v1
+        x0 = inverse[s, 0] * t0 + inverse[s, 2] * t1
+        x1 = inverse[s, 2] * t0 + inverse[s, 1] * t1
+        if s + 1 < stations:
+            x0 -= lower[s + 1, 0] * u0 + lower[s + 1, 2] * u1
+            x1 -= lower[s + 1, 1] * u0 + lower[s + 1, 3] * u1
+        right[s, 0] = x0
+        right[s, 1] = x1
+        v0 = u0
+        v1 = u1
+        u0 = x0
+        u1 = x1
 
 
 @compiled
-def add_row(matrix: Array, right: Array, s: int, weight: float, g0: float, g1: float, wanted: float) -> None:
+def smooth_terms(profile: Array, mean: Array, last: Array, step_m: float, prices: Prices, band: Band) -> None:
+    """Band system of path, shape, slope, change of slope and hysteresis, written anew."""
+    own, one, two, right, _, _ = band
+    stations = profile.shape[0]
+    bend = prices.bend / step_m**3
+    flat = prices.slope / step_m
+    gentle = (prices.steep * step_m) ** 2
+    near = prices.far_m**2
+    drawn = step_m * (prices.shape + prices.keep)
+    for s in range(stations):
+        size = profile[s, 0] ** 2 + profile[s, 1] ** 2
+        path = step_m * prices.path
+        if size > near:
+            path *= prices.far_m / math.sqrt(size)
+        own[s, 0] = path + drawn
+        two[s] = 0.0
+        one[s] = 0.0
+        for a in range(2):
+            right[s, a] = step_m * (prices.shape * mean[s, a] + prices.keep * last[s, a])
+        if s > 0:
+            rise = (profile[s, 0] - profile[s - 1, 0]) ** 2 + (profile[s, 1] - profile[s - 1, 1]) ** 2
+            slope = flat
+            if rise > gentle:
+                slope *= steep(math.sqrt(rise) / step_m, prices.steep)
+            own[s, 0] += slope
+            own[s - 1, 0] += slope
+            one[s] -= slope
+        if s > 1:
+            own[s, 0] += bend
+            own[s - 1, 0] += 4.0 * bend
+            own[s - 2, 0] += bend
+            one[s] -= 2.0 * bend
+            one[s - 1] -= 2.0 * bend
+            two[s] = bend
+    for s in range(stations):
+        own[s, 1] = own[s, 0]
+        own[s, 2] = 0.0
+
+
+@compiled
+def add_row(own: Array, right: Array, s: int, weight: float, g0: float, g1: float, wanted: float) -> None:
     """Add weight (wanted - g x_s)^2 of station s to a band system."""
-    j = 2 * s
-    matrix[j, 0] += weight * g0 * g0
-    matrix[j + 1, 0] += weight * g1 * g1
-    matrix[j + 1, 1] += weight * g0 * g1
-    right[j] += weight * g0 * wanted
-    right[j + 1] += weight * g1 * wanted
+    own[s, 0] += weight * g0 * g0
+    own[s, 1] += weight * g1 * g1
+    own[s, 2] += weight * g0 * g1
+    right[s, 0] += weight * g0 * wanted
+    right[s, 1] += weight * g1 * wanted
 
 
 @compiled
 def add_solids(
-    solids: Solids,
-    boxes: SolidBoxes,
-    found: NDArray[np.int64],
-    count: int,
-    frame: Frame,
-    along: float,
-    lane: Array,
-    covariance: Array,
-    k: float,
-    need_m: float,
-    reach: float,
-    step_m: float,
-    weight: float,
-    draft: Array,
-    profile: Array,
-    matrix: Array,
-    right: Array,
+    sight: Sight, i: int, step_m: float, weight: float, draft: Array, profile: Array, band: Band
 ) -> None:
     """Add the linearised shortfalls of a profile to its band system.
 
     Where the distance grows along the path only, as before a wall, its gradient does not tell which way to
     give: there the profile is drawn to its draft.
     """
+    own, right = band.own, band.right
+    near, found = sight.near, sight.found
+    solids, frame, turned, covariance = sight.solids, sight.frame, sight.turned[i], sight.covariance[i]
+    k, need = sight.k, sight.need_m
+    lane, height, start = sight.lanes[i, 0], sight.lanes[i, 1], sight.along[i]
     stations = profile.shape[0]
-    for entry in range(count):
-        i = found[entry]
-        s0 = max(0, int(np.ceil((boxes.low[i, 0] - reach - along) / step_m)))
-        s1 = min(stations - 1, int(np.floor((boxes.high[i, 0] + reach - along) / step_m)))
+    lowest = highest = profile[0, 0]
+    for s in range(1, stations):
+        lowest = min(lowest, profile[s, 0])
+        highest = max(highest, profile[s, 0])
+    lowest += lane
+    highest += lane
+    for entry in range(sight.solid_count[i]):
+        if lowest > near[i, entry, HIGH + 1] or highest < near[i, entry, LOW + 1]:
+            continue
+        s0 = max(0, int(np.ceil((near[i, entry, LOW] - start) / step_m)))
+        s1 = min(stations - 1, int(np.floor((near[i, entry, HIGH] - start) / step_m)))
+        ball = near[i, entry, ROUND]
         for s in range(s0, s1 + 1):
-            left = lane[0] + profile[s, 0]
-            if left < boxes.low[i, 1] - reach or left > boxes.high[i, 1] + reach:
+            along = start + s * step_m
+            left = lane + profile[s, 0]
+            up = height + profile[s, 1]
+            if left < near[i, entry, LOW + 1] or left > near[i, entry, HIGH + 1]:
                 continue
-            up = lane[1] + profile[s, 1]
-            if up < boxes.low[i, 2] - reach or up > boxes.high[i, 2] + reach:
+            if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
                 continue
-            short, g0, g1 = shortfall(solids, i, frame, along + s * step_m, left, up, covariance, k, need_m)
+            x = along - near[i, entry, ALONG]
+            y = left - near[i, entry, LEFT]
+            z = ball * (up - near[i, entry, UP])
+            if ball >= 0.0 and x * x + y * y + z * z > near[i, entry, OUTER2]:
+                continue
+            if is_round(near, i, entry, up):
+                short, g0, g1 = round_shortfall(
+                    x, y, z, near[i, entry, RADIUS], near[i, entry, TOUCHED], turned, k, need
+                )
+            else:
+                short, g0, g1 = shortfall(
+                    solids, found[i, entry], frame, along, left, up, covariance, k, need
+                )  # fmt: skip
             if short > 0.0 and g0 * g0 + g1 * g1 < LEAST_ACROSS**2:
-                add_row(matrix, right, s, weight * step_m, 1.0, 0.0, draft[s, 0])
-                add_row(matrix, right, s, weight * step_m, 0.0, 1.0, draft[s, 1])
+                add_row(own, right, s, weight * step_m, 1.0, 0.0, draft[s, 0])
+                add_row(own, right, s, weight * step_m, 0.0, 1.0, draft[s, 1])
             elif short > 0.0:
                 wanted = short + g0 * profile[s, 0] + g1 * profile[s, 1]
-                add_row(matrix, right, s, weight * step_m, g0, g1, wanted)
+                add_row(own, right, s, weight * step_m, g0, g1, wanted)
 
 
 @compiled
@@ -143,65 +240,70 @@ def add_neighbour(
     step_m: float,
     weight: float,
     profile: Array,
-    matrix: Array,
-    right: Array,
+    band: Band,
 ) -> None:
     """Add the linearised lack of separation from another UAV's profile.
 
     ``along`` and ``lane`` (2,) are this UAV's place relative to the other's; each yields half.
     """
+    own, right = band.own, band.right
     for s in range(profile.shape[0]):
         d0 = lane[0] + profile[s, 0] - other[s, 0]
         d1 = lane[1] + profile[s, 1] - other[s, 1]
-        distance = np.sqrt(along * along + d0 * d0 + d1 * d1)
-        if distance >= separation:
+        if along * along + d0 * d0 + d1 * d1 >= separation * separation:
             continue
-        across = max(np.sqrt(d0 * d0 + d1 * d1), 1e-9)
+        across = max(math.sqrt(d0 * d0 + d1 * d1), 1e-9)
         g0 = d0 / across
         g1 = d1 / across
         if d0 == 0.0 and d1 == 0.0:
             g0 = 1.0
-        target = np.sqrt(max(separation * separation - along * along, 0.0)) - across
+        target = math.sqrt(max(separation * separation - along * along, 0.0)) - across
         wanted = 0.5 * target + g0 * profile[s, 0] + g1 * profile[s, 1]
-        add_row(matrix, right, s, weight * step_m, g0, g1, wanted)
+        add_row(own, right, s, weight * step_m, g0, g1, wanted)
 
 
 @compiled
-def exact_missing(
-    solids: Solids,
-    boxes: SolidBoxes,
-    found: NDArray[np.int64],
-    count: int,
-    frame: Frame,
-    along: float,
-    lane: Array,
-    covariance: Array,
-    k: float,
-    need_m: float,
-    reach: float,
-    step_m: float,
-    profile: Array,
-    missing: Array,
-) -> None:
+def exact_missing(sight: Sight, i: int, step_m: float, profile: Array, missing: Array) -> None:
     """Largest shortfall (station,) along a profile, 0 where nothing is short, in place."""
     missing[:] = 0.0
+    near, found = sight.near, sight.found
+    solids, frame, turned, covariance = sight.solids, sight.frame, sight.turned[i], sight.covariance[i]
+    k, need = sight.k, sight.need_m
+    lane, height, start = sight.lanes[i, 0], sight.lanes[i, 1], sight.along[i]
     stations = profile.shape[0]
-    for entry in range(count):
-        i = found[entry]
-        s0 = max(0, int(np.ceil((boxes.low[i, 0] - reach - along) / step_m)))
-        s1 = min(stations - 1, int(np.floor((boxes.high[i, 0] + reach - along) / step_m)))
+    lowest = highest = profile[0, 0]
+    for s in range(1, stations):
+        lowest = min(lowest, profile[s, 0])
+        highest = max(highest, profile[s, 0])
+    lowest += lane
+    highest += lane
+    for entry in range(sight.solid_count[i]):
+        if lowest > near[i, entry, HIGH + 1] or highest < near[i, entry, LOW + 1]:
+            continue
+        s0 = max(0, int(np.ceil((near[i, entry, LOW] - start) / step_m)))
+        s1 = min(stations - 1, int(np.floor((near[i, entry, HIGH] - start) / step_m)))
+        ball = near[i, entry, ROUND]
         for s in range(s0, s1 + 1):
-            short = shortfall(
-                solids,
-                i,
-                frame,
-                along + s * step_m,
-                lane[0] + profile[s, 0],
-                lane[1] + profile[s, 1],
-                covariance,
-                k,
-                need_m,
-            )[0]
+            along = start + s * step_m
+            left = lane + profile[s, 0]
+            up = height + profile[s, 1]
+            if left < near[i, entry, LOW + 1] or left > near[i, entry, HIGH + 1]:
+                continue
+            if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
+                continue
+            x = along - near[i, entry, ALONG]
+            y = left - near[i, entry, LEFT]
+            z = ball * (up - near[i, entry, UP])
+            if ball >= 0.0 and x * x + y * y + z * z > near[i, entry, OUTER2]:
+                continue
+            if is_round(near, i, entry, up):
+                short = round_shortfall(
+                    x, y, z, near[i, entry, RADIUS], near[i, entry, TOUCHED], turned, k, need
+                )[0]
+            else:
+                short = shortfall(
+                    solids, found[i, entry], frame, along, left, up, covariance, k, need
+                )[0]  # fmt: skip
             missing[s] = max(missing[s], short)
 
 

@@ -1,7 +1,8 @@
 """Clearance of places on a guide: which solids matter, and how much of the margin is missing.
 
 The shortfall of a place is ``r_uav + k sigma(n) + spare - d``: positive where the inflated UAV, with a little
-to spare, does not fit. Places are given in path coordinates, solids and covariances in the world.
+to spare, does not fit. Places are given in path coordinates, solids and covariances in the world; what is
+round is turned into path coordinates once a plan, since thousands of places are asked about.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.formation import PathFrame
 from napf_mpc.jit import compiled
-from napf_mpc.world.distance import SPHERE, Solids, signed_distance
+from napf_mpc.world.distance import BASE, CYLINDER, SPHERE, TOP, TOUCH_M, A, Solids, X, Y, signed_distance
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -49,6 +50,112 @@ def solid_boxes(obstacles: ObstacleSet, path: PathFrame) -> SolidBoxes:
     upper[:, 2] = np.minimum(upper[:, 2], ENDLESS_M)
     corners = np.stack([path.to_path(np.where(np.array(pick), upper, lower)) for pick in np.ndindex(2, 2, 2)])
     return SolidBoxes(np.ascontiguousarray(corners.min(0)), np.ascontiguousarray(corners.max(0)))
+
+
+# Columns of `Sight.near`: where a solid is, the box in which it can matter, and what is round about it.
+ALONG, LEFT, UP, RADIUS = 0, 1, 2, 3
+ROUND = 4
+"""1 a sphere, 0 a cylinder that stands upright in the path's frame, -1 anything else."""
+OUTER2 = 5
+"""Squared distance from centre or axis beyond which nothing is short; infinite if not round [m^2]."""
+LOW, HIGH = 6, 9
+"""First of three columns each: corners of the box with the reach all round."""
+BOTTOM, LID = 12, 13
+"""Base and top of a cylinder in the path's frame."""
+TOUCHED = 14
+"""Variance in the direction that counts as the gradient at the centre or on the axis [m^2]."""
+COLUMNS = 15
+
+
+class Sight(NamedTuple):
+    """What each UAV of a run sees ahead, with scratch for what is short where."""
+
+    solids: Solids
+    frame: Frame
+    k: float
+    need_m: float  # radius and spare
+    along: Array  # (uav,)
+    lanes: Array  # (uav, 2)
+    covariance: Array  # (uav, 3, 3) in the world [m^2]
+    turned: Array  # (uav, 3, 3) the same in path coordinates
+    reach: Array  # (uav,)
+    found: NDArray[np.int64]  # (uav, most) solids
+    solid_count: NDArray[np.int64]  # (uav,) their number
+    near: Array  # (uav, most, COLUMNS)
+    here: NDArray[np.int64]  # (uav, station, most) which of the found ones reach a station
+    here_count: NDArray[np.int64]  # (uav, station)
+    missing: Array  # (uav, station, layer, cell) shortfalls, 0 where nothing is short, where known
+    known: NDArray[np.int64]  # (uav, station, layer, 2) first and last cell known, of each layer
+
+
+@compiled
+def round_shortfall(
+    x: float, y: float, z: float, radius: float, touched: float, covariance: Array, k: float, need_m: float
+) -> tuple[float, float, float]:
+    """Missing clearance [m] to a sphere, or with z = 0 an upright cylinder, and the gradient left and up.
+
+    x, y, z lead from the centre or axis; ``covariance`` is in the same axes, ``touched`` the variance in the
+    direction that is taken at the centre itself.
+    """
+    c = covariance
+    square = x * x + y * y + z * z
+    form = c[0, 0] * x * x + c[1, 1] * y * y + c[2, 2] * z * z
+    form += 2.0 * (c[0, 1] * x * y + c[0, 2] * x * z + c[1, 2] * y * z)
+    off = square > TOUCH_M * TOUCH_M
+    variance = form / square if off else touched
+    radial = math.sqrt(square)
+    scale = 1.0 / radial if off else 0.0
+    return need_m + k * math.sqrt(max(variance, 0.0)) - (radial - radius), y * scale, z * scale
+
+
+@compiled
+def is_round(near: Array, i: int, entry: int, up: float) -> bool:
+    """Whether only the distance from a centre or axis counts at a height: a sphere, or well below a lid."""
+    if near[i, entry, ROUND] != 0.0:
+        return bool(near[i, entry, ROUND] > 0.0)
+    return bool(min(near[i, entry, LID] - up, up - near[i, entry, BOTTOM]) >= near[i, entry, RADIUS])
+
+
+@compiled
+def look(sight: Sight, boxes: SolidBoxes, i: int) -> None:
+    """Fill in the table of what UAV i has found, and its covariance in path coordinates."""
+    ax = sight.frame.axes
+    c = sight.covariance[i]
+    for a in range(3):
+        for b in range(3):
+            total = 0.0
+            for p in range(3):
+                for q in range(3):
+                    total += ax[a, p] * c[p, q] * ax[b, q]
+            sight.turned[i, a, b] = total
+    level = ax[0, 2] == 0.0 and ax[1, 2] == 0.0 and ax[2, 2] > 0.0
+    reach = sight.reach[i]
+    for entry in range(sight.solid_count[i]):
+        solid = sight.found[i, entry]
+        row = sight.near[i, entry]
+        given = sight.solids.parameters[solid]
+        for a in range(3):
+            row[LOW + a] = boxes.low[solid, a] - reach
+            row[HIGH + a] = boxes.high[solid, a] + reach
+            row[a] = 0.5 * (boxes.low[solid, a] + boxes.high[solid, a])
+        row[ROUND] = -1.0
+        row[RADIUS] = 0.0
+        row[OUTER2] = np.inf
+        kind = sight.solids.kind[solid]
+        if kind == SPHERE or (kind == CYLINDER and level):
+            row[ROUND] = 1.0 if kind == SPHERE else 0.0
+            row[RADIUS] = given[A]
+            row[TOUCHED] = c[2, 2] if kind == SPHERE else c[0, 0]
+            row[OUTER2] = (given[A] + reach) ** 2
+            x = given[X] - sight.frame.origin[0]
+            y = given[Y] - sight.frame.origin[1]
+            z = given[BASE] - sight.frame.origin[2]
+            if kind == CYLINDER:
+                row[BOTTOM] = z * ax[2, 2]
+                row[LID] = (given[TOP] - sight.frame.origin[2]) * ax[2, 2]
+                z = 0.0
+            for a in range(3 if kind == SPHERE else 2):
+                row[a] = x * ax[a, 0] + y * ax[a, 1] + z * ax[a, 2]
 
 
 @compiled

@@ -3,6 +3,9 @@
 Stations lie ahead of a UAV along the path; at each it may be in one of some lateral cells and vertical
 layers. The cheapest profile is exact on that lattice, so there is no local minimum in which a wall, a U or
 an obstacle met head-on could hold it.
+
+It is found without looking at most of the lattice: a place is left out if what leads to it, and the least
+that must follow, cost more than a profile that is known, or than a guess that is raised until one is found.
 """
 
 from __future__ import annotations
@@ -14,10 +17,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
-from napf_mpc.planners.guide_clearance import Frame, SolidBoxes, shortfall
-from napf_mpc.world.distance import Solids
+from napf_mpc.planners.guide_clearance import (
+    ALONG,
+    HIGH,
+    LEFT,
+    LOW,
+    OUTER2,
+    RADIUS,
+    ROUND,
+    TOUCHED,
+    UP,
+    Sight,
+    is_round,
+    shortfall,
+)
 
 Array = NDArray[np.float64]
+
+HALO = 4
+"""Cells on each side of a row of values that are never places: two for steps out, two for steps back in."""
+LAYER_HALO = 2
+FIRST_GUESS = 400.0
+"""Price of a profile, per UAV, that the search first takes for an upper bound."""
 
 
 class Lattice(NamedTuple):
@@ -79,200 +100,639 @@ def missing_price(missing: float, prices: Prices) -> float:
     return price + 9.0 * prices.breach * max(0.0, beyond - prices.tolerance_m)
 
 
+class Query(NamedTuple):
+    """Whose profile is sought, and what it is drawn to."""
+
+    first: int  # UAVs first ... stop - 1 share it
+    stop: int
+    shape: float
+    mean: Array  # (fine station, 2) of the others
+    last: Array  # (uav, fine station, 2)
+    chosen: Array  # (uav, station, 2) profiles of the UAVs before the first, to keep apart from
+    separation: Array  # (uav, uav)
+    crowded: bool  # whether any of those is near enough to matter
+    aside: float  # price of a metre on the spot, negative if not possible
+
+
+class Bench(NamedTuple):
+    """Scratch of the search."""
+
+    value: Array  # (station, layer and halo, cell and halo) price of getting to each place
+    own: Array  # (layer, cell) places' own prices without what is in the way
+    bend: Array  # (layer, cell) squared offsets, bent
+    ahead: Array  # (station,) least price of what follows, per squared offset [1/m^2]
+
+
 @compiled
-def fill_missing(
-    solids: Solids,
-    boxes: SolidBoxes,
-    found: NDArray[np.int64],
-    count: int,
-    frame: Frame,
-    along: float,
-    lane: Array,
-    covariance: Array,
+def list_here(sight: Sight, i: int, lattice: Lattice) -> None:
+    """Note which of the solids that UAV i has found reach which stations."""
+    near = sight.near
+    for s in range(lattice.stations):
+        sight.here_count[i, s] = 0
+    for entry in range(sight.solid_count[i]):
+        half_step = _half_step(near[i, entry, LOW], near[i, entry, HIGH], lattice.step_m)
+        low = near[i, entry, LOW] - half_step - sight.along[i]
+        high = near[i, entry, HIGH] + half_step - sight.along[i]
+        s0 = max(0, int(np.ceil(low / lattice.step_m)))
+        s1 = min(lattice.stations - 1, int(np.floor(high / lattice.step_m)))
+        for s in range(s0, s1 + 1):
+            sight.here[i, s, sight.here_count[i, s]] = entry
+            sight.here_count[i, s] += 1
+    for s in range(lattice.stations):
+        for v in range(sight.known.shape[2]):
+            sight.known[i, s, v, 0] = 0
+            sight.known[i, s, v, 1] = -1
+
+
+@compiled
+def _half_step(low: float, high: float, step_m: float) -> float:
+    """How far back and forth a place stands for its piece of the path, next to what reaches so far.
+
+    Next to something thin the nearest point of half a step is taken, so that nothing is missed between
+    stations.
+    """
+    return 0.5 * step_m if 0.5 * (high - low) < step_m else 0.0
+
+
+@compiled
+def cover(
+    sight: Sight, i: int, lattice: Lattice, below: int, s: int, v0: int, v1: int, low: int, high: int
+) -> None:
+    """Make sure that the shortfalls of UAV i in the cells low ... high of layers v0 ... v1 are known.
+
+    Only where a solid's reach crosses a row they are worked out; the largest of all solids counts.
+    """
+    near, found, here, turned = sight.near, sight.found, sight.here, sight.turned
+    missing, known = sight.missing, sight.known
+    solids, frame, covariance = sight.solids, sight.frame, sight.covariance
+    k, need = sight.k, sight.need_m
+    here_count = sight.here_count[i, s]
+    lane = sight.lanes[i, 0]
+    height = sight.lanes[i, 1]
+    cell = lattice.cell_m
+    half = lattice.half
+    station = sight.along[i] + s * lattice.step_m
+    for v in range(v0, v1 + 1):
+        k0 = known[i, s, v, 0]
+        k1 = known[i, s, v, 1]
+        if k0 <= low and high <= k1:
+            continue
+        # What is known is one stretch of cells: it grows to the left, to the right or both.
+        if k1 < k0:
+            k0 = high + 1
+            k1 = high
+        first = min(low, k0)
+        last = max(high, k1)
+        known[i, s, v, 0] = first
+        known[i, s, v, 1] = last
+        for c in range(first, k0):
+            missing[i, s, v, c] = 0.0
+        for c in range(k1 + 1, last + 1):
+            missing[i, s, v, c] = 0.0
+        up = height + (v - below) * lattice.layer_m
+        for n in range(here_count):
+            entry = here[i, s, n]
+            if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
+                continue
+            at = station
+            half_step = _half_step(near[i, entry, LOW], near[i, entry, HIGH], lattice.step_m)
+            if half_step > 0.0:
+                middle = 0.5 * (near[i, entry, LOW] + near[i, entry, HIGH])
+                at = min(max(middle, station - half_step), station + half_step)
+            x = at - near[i, entry, ALONG]
+            z = near[i, entry, ROUND] * (up - near[i, entry, UP])
+            if near[i, entry, ROUND] >= 0.0:
+                across2 = near[i, entry, OUTER2] - x * x - z * z
+                if across2 < 0.0:
+                    continue
+                across = math.sqrt(across2)
+                left = near[i, entry, LEFT] - across
+                right = near[i, entry, LEFT] + across
+            else:
+                left = near[i, entry, LOW + 1]
+                right = near[i, entry, HIGH + 1]
+            c0 = max(first, int(np.floor((left - lane) / cell)) + half)
+            c1 = min(last, int(np.ceil((right - lane) / cell)) + half)
+            if is_round(near, i, entry, up):
+                y0 = lane - half * cell - near[i, entry, LEFT]
+                for a, z1 in ((c0, min(c1, k0 - 1)), (max(c0, k1 + 1), c1)):
+                    if a <= z1:
+                        _fill_round(
+                            missing, i, s, v, a, z1, y0, cell, x, z, near[i, entry, RADIUS],
+                            near[i, entry, TOUCHED], turned, k, need,
+                        )  # fmt: skip
+                continue
+            for c in range(c0, c1 + 1):
+                if k0 <= c <= k1:
+                    continue
+                place = lane + (c - half) * cell
+                short = shortfall(solids, found[i, entry], frame, at, place, up, covariance[i], k, need)[0]
+                missing[i, s, v, c] = max(missing[i, s, v, c], short)
+
+
+@compiled
+def _fill_round(
+    missing: Array,
+    i: int,
+    s: int,
+    v: int,
+    c0: int,
+    c1: int,
+    y0: float,
+    cell_m: float,
+    x: float,
+    z: float,
+    radius: float,
+    touched: float,
+    turned: Array,
     k: float,
     need_m: float,
-    reach: float,
-    lattice: Lattice,
-    below: int,
-    missing: Array,
-) -> bool:
-    """Largest shortfall at every place (station, cell, layer), 0 where nothing is short, in place.
-
-    Next to something thin a place stands for its piece of the path half a step back and forth, of which the
-    nearest point is taken, so that nothing is missed between stations. Returns whether anything is short.
-    """
-    missing[:] = 0.0
-    layers = missing.shape[2]
-    any_short = False
-    for entry in range(count):
-        i = found[entry]
-        middle = 0.5 * (boxes.low[i, 0] + boxes.high[i, 0])
-        thin = boxes.high[i, 0] - middle + reach < lattice.step_m
-        half_step = 0.5 * lattice.step_m if thin else 0.0
-        for s in range(lattice.stations):
-            at = along + s * lattice.step_m
-            if at + half_step < boxes.low[i, 0] - reach or at - half_step > boxes.high[i, 0] + reach:
-                continue
-            at = min(max(middle, at - half_step), at + half_step)
-            c0 = int(np.floor((boxes.low[i, 1] - reach - lane[0]) / lattice.cell_m)) + lattice.half
-            c1 = int(np.ceil((boxes.high[i, 1] + reach - lane[0]) / lattice.cell_m)) + lattice.half
-            for c in range(max(0, c0), min(2 * lattice.half, c1) + 1):
-                left = lane[0] + (c - lattice.half) * lattice.cell_m
-                for v in range(layers):
-                    up = lane[1] + (v - below) * lattice.layer_m
-                    if up < boxes.low[i, 2] - reach or up > boxes.high[i, 2] + reach:
-                        continue
-                    short = shortfall(solids, i, frame, at, left, up, covariance, k, need_m)[0]
-                    if short > missing[s, c, v]:
-                        missing[s, c, v] = short
-                        any_short = True
-    return any_short
+) -> None:
+    """Take a round solid into the shortfalls of a row's cells c0 ... c1; the first is y0 + c0 cells away."""
+    k0 = turned[i, 0, 0] * x * x + turned[i, 2, 2] * z * z + 2.0 * turned[i, 0, 2] * x * z
+    k1 = 2.0 * (turned[i, 0, 1] * x + turned[i, 1, 2] * z)
+    k2 = turned[i, 1, 1]
+    flat = x * x + z * z
+    # Unsigned, so that the compiler need not think of indices from the end, and vectorises.
+    ui = np.uint64(i)
+    us = np.uint64(s)
+    uv = np.uint64(v)
+    first = np.uint64(c0)
+    for n in range(np.uint64(c1 - c0 + 1)):
+        c = first + n
+        y = y0 + cell_m * np.float64(np.int64(c))
+        square = flat + y * y
+        variance = (k0 + y * (k1 + y * k2)) / square if square > 1e-18 else touched
+        short = need_m + k * math.sqrt(max(variance, 0.0)) - (math.sqrt(square) - radius)
+        missing[ui, us, uv, c] = max(missing[ui, us, uv, c], short)
 
 
 @compiled
-def node_prices(
-    missing: Array,
-    weight: float,
-    mean: Array,
-    last: Array,
-    shape: float,
-    lattice: Lattice,
-    below: int,
-    prices: Prices,
-    node: Array,
-) -> None:
-    """Price of being at each place, a step's worth; ``weight`` UAVs pay for offset and hysteresis."""
-    stations, cells, layers = missing.shape
-    for s in range(stations):
-        f = lattice.fine * s
-        # What lies far ahead may be thought over again; what is near has been decided.
-        keep = prices.keep * (1.0 - s / stations)
-        for c in range(cells):
+def any_short(sight: Sight, i: int, lattice: Lattice, below: int, layers: int) -> bool:
+    """Whether anything is short for UAV i anywhere on the lattice."""
+    cells = 2 * lattice.half + 1
+    # What is short anywhere is so next to the middle of a solid, most times.
+    near = sight.near
+    for entry in range(sight.solid_count[i]):
+        along = 0.5 * (near[i, entry, LOW] + near[i, entry, HIGH]) - sight.along[i]
+        left = 0.5 * (near[i, entry, LOW + 1] + near[i, entry, HIGH + 1]) - sight.lanes[i, 0]
+        s = round(along / lattice.step_m)
+        c = round(left / lattice.cell_m) + lattice.half
+        s = min(max(s, 0), lattice.stations - 1)
+        c = min(max(c, 0), cells - 1)
+        for v in range(layers):
+            cover(sight, i, lattice, below, s, v, v, c, c)
+            if sight.missing[i, s, v, c] > 0.0:
+                return True
+    for s in range(lattice.stations):
+        if sight.here_count[i, s] == 0:
+            continue
+        for v in range(layers):
+            cover(sight, i, lattice, below, s, v, v, 0, cells - 1)
+            for c in range(cells):
+                if sight.missing[i, s, v, c] > 0.0:
+                    return True
+    return False
+
+
+@compiled
+def bend_offsets(lattice: Lattice, below: int, layers: int, prices: Prices, bend: Array) -> None:
+    """Squared offsets (layer, cell) of all places, bent."""
+    for v in range(layers):
+        up = (v - below) * lattice.layer_m
+        for c in range(2 * lattice.half + 1):
             left = (c - lattice.half) * lattice.cell_m
-            for v in range(layers):
-                up = (v - below) * lattice.layer_m
-                price = prices.path * bent(left * left + up * up, prices.far_m)
-                if shape > 0.0:
-                    square = (left - mean[f, 0]) ** 2 + (up - mean[f, 1]) ** 2
-                    price += shape * bent(square, prices.far_m)
-                square = (left - last[f, 0]) ** 2 + (up - last[f, 1]) ** 2
-                price += keep * min(square, prices.keep_m * prices.keep_m)
-                node[s, c, v] += lattice.step_m * weight * price
-                node[s, c, v] += lattice.step_m * missing_price(missing[s, c, v], prices)
+            bend[v, c] = bent(left * left + up * up, prices.far_m)
 
 
 @compiled
-def node_neighbour(
-    along: float,
-    lane: Array,
-    separation: float,
-    other: Array,
+def price_ahead(lattice: Lattice, path: float, slope: float, ahead: Array) -> None:
+    """Least price of all that follows a station, per squared offset (bent): back to the lane, nothing else.
+
+    Offsets that follow cost a step's worth of ``path`` each, and slopes at least their square: the Riccati
+    recursion of that problem. Steeper slopes cost more, and offsets far out no less than this makes of them.
+    """
+    ahead[lattice.stations - 1] = 0.0
+    rise = slope / lattice.step_m
+    for s in range(lattice.stations - 2, -1, -1):
+        next_one = lattice.step_m * path + ahead[s + 1]
+        ahead[s] = rise * next_one / (rise + next_one)
+
+
+@compiled
+def _own_price(
+    left: float, up: float, bend: float, mean: Array, last: Array, i: int, f: int, shape: float, keep: float,
+    prices: Prices,
+) -> float:  # fmt: skip
+    """What one UAV pays a metre for being at a place: offset, shape and hysteresis."""
+    price = prices.path * bend
+    if shape > 0.0:
+        price += shape * bent((left - mean[f, 0]) ** 2 + (up - mean[f, 1]) ** 2, prices.far_m)
+    square = (left - last[i, f, 0]) ** 2 + (up - last[i, f, 1]) ** 2
+    return float(price + keep * min(square, prices.keep_m * prices.keep_m))
+
+
+@compiled
+def _apart_price(
+    sight: Sight, lattice: Lattice, below: int, price: float, query: Query, s: int, v: int, c: int
+) -> float:
+    """Price of coming too near to the UAVs that have chosen already."""
+    total = 0.0
+    i = query.first
+    for j in range(i):
+        least = query.separation[i, j]
+        along = sight.along[i] - sight.along[j]
+        if abs(along) >= least:
+            continue
+        d0 = sight.lanes[i, 0] - sight.lanes[j, 0] + (c - lattice.half) * lattice.cell_m
+        d1 = sight.lanes[i, 1] - sight.lanes[j, 1] + (v - below) * lattice.layer_m
+        d0 -= query.chosen[j, s, 0]
+        d1 -= query.chosen[j, s, 1]
+        square = along * along + d0 * d0 + d1 * d1
+        if square < least * least:
+            total += lattice.step_m * price * (least - math.sqrt(square)) ** 2
+    return total
+
+
+@compiled
+def _edge_prices(lattice: Lattice, slope_price: float, steep_slope: float, edge: Array) -> None:
+    """Prices (3, 2) of steps of so many cells and layers from one station to the next."""
+    for dc in range(3):
+        for dv in range(2):
+            square = (dc * lattice.cell_m) ** 2 + (dv * lattice.layer_m) ** 2
+            factor = steep(math.sqrt(square) / lattice.step_m, steep_slope)
+            edge[dc, dv] = slope_price * factor * square / lattice.step_m
+
+
+@compiled
+def price_of(
+    sight: Sight,
     lattice: Lattice,
     below: int,
-    price: float,
-    node: Array,
-) -> None:
-    """Add the price of coming too near to the profile of a UAV that has chosen already."""
-    stations, cells, layers = node.shape
-    if abs(along) >= separation:
-        return
-    for s in range(1, stations):
-        for c in range(cells):
-            d0 = lane[0] + (c - lattice.half) * lattice.cell_m - other[s, 0]
-            if abs(d0) >= separation:
-                continue
-            for v in range(layers):
-                d1 = lane[1] + (v - below) * lattice.layer_m - other[s, 1]
-                distance = np.sqrt(along * along + d0 * d0 + d1 * d1)
-                if distance < separation:
-                    node[s, c, v] += lattice.step_m * price * (separation - distance) ** 2
+    layers: int,
+    prices: Prices,
+    query: Query,
+    bends: Array,
+    edge: Array,
+    start_cell: int,
+    start_layer: int,
+    wanted: Array,
+) -> float:
+    """Price of the lattice's profile that follows a wanted one (fine station, 2) as steps allow."""
+    mean, last = query.mean, query.last
+    here_count, missing, known = sight.here_count, sight.missing, sight.known
+    c = start_cell
+    v = start_layer
+    total = 0.0
+    for s in range(lattice.stations):
+        f = lattice.fine * s
+        if s > 0:
+            to_c = round(wanted[f, 0] / lattice.cell_m) + lattice.half
+            to_v = round(wanted[f, 1] / lattice.layer_m) + below
+            dc = min(max(min(max(to_c, 0), 2 * lattice.half) - c, -2), 2)
+            dv = min(max(min(max(to_v, 0), layers - 1) - v, -1), 1)
+            c += dc
+            v += dv
+            total += edge[abs(dc), abs(dv)]
+        keep = prices.keep * (1.0 - s / lattice.stations)
+        left = (c - lattice.half) * lattice.cell_m
+        up = (v - below) * lattice.layer_m
+        for i in range(query.first, query.stop):
+            price = _own_price(left, up, bends[v, c], mean, last, i, f, query.shape, keep, prices)
+            total += lattice.step_m * price
+            if here_count[i, s] > 0:
+                if c < known[i, s, v, 0] or c > known[i, s, v, 1]:
+                    cover(sight, i, lattice, below, s, v, v, c, c)
+                total += lattice.step_m * missing_price(missing[i, s, v, c], prices)
+        if query.crowded and s > 0:
+            total += _apart_price(sight, lattice, below, prices.apart, query, s, v, c)
+    return total
 
 
 @compiled
-def _spread(place: Array, cell: int, layer: int, per_cell: float, per_layer: float, value: Array) -> None:
-    """Prices (cell, layer) of getting to each place on the spot: straight up or down first, then aside.
+def _spread(
+    value: Array,
+    lowest: int,
+    highest: int,
+    cells: int,
+    cell: int,
+    layer: int,
+    per_cell: float,
+    per_layer: float,
+) -> None:
+    """Prices of getting to each place on the spot, from places' own: straight up or down first, then aside.
 
     Every place on the way is paid for, so that what stands beside a UAV is not stepped through.
     """
-    cells, layers = place.shape
-    for v in range(layer + 1, layers):
-        value[cell, v] = value[cell, v - 1] + per_layer + place[cell, v]
-    for v in range(layer - 1, -1, -1):
-        value[cell, v] = value[cell, v + 1] + per_layer + place[cell, v]
-    for v in range(layers):
+    h = HALO
+    b = LAYER_HALO
+    for v in range(layer + 1, highest + 1):
+        value[b + v, h + cell] += value[b + v - 1, h + cell] + per_layer
+    for v in range(layer - 1, lowest - 1, -1):
+        value[b + v, h + cell] += value[b + v + 1, h + cell] + per_layer
+    for v in range(lowest, highest + 1):
         for c in range(cell + 1, cells):
-            value[c, v] = value[c - 1, v] + per_cell + place[c, v]
+            value[b + v, h + c] += value[b + v, h + c - 1] + per_cell
         for c in range(cell - 1, -1, -1):
-            value[c, v] = value[c + 1, v] + per_cell + place[c, v]
+            value[b + v, h + c] += value[b + v, h + c + 1] + per_cell
+
+
+@compiled
+def _relax(
+    value: Array,
+    bends: Array,
+    s: int,
+    v: int,
+    low: int,
+    high: int,
+    edge: Array,
+    least: float,
+    limit: float,
+) -> None:
+    """Cheapest prices of getting to a row's cells low ... high from the station before, without their own.
+
+    Infinite where that and ``least`` for the squared offset are beyond the limit.
+    """
+    e00 = edge[0, 0]
+    e10 = edge[1, 0]
+    e20 = edge[2, 0]
+    e01 = edge[0, 1]
+    e11 = edge[1, 1]
+    e21 = edge[2, 1]
+    # Unsigned, so that the compiler need not think of indices from the end, and vectorises.
+    one = np.uint64(1)
+    two = np.uint64(2)
+    to = np.uint64(s)
+    b = np.uint64(s - 1)
+    level = np.uint64(LAYER_HALO + v)
+    under = level - one
+    over = level + one
+    first = np.uint64(HALO + low)
+    layer = np.uint64(v)
+    column = np.uint64(low)
+    for k in range(np.uint64(high - low + 1)):
+        c = first + k
+        p = c - one
+        q = c + one
+        x = value[b, level, c] + e00
+        x = min(min(value[b, level, p], value[b, level, q]) + e10, x)
+        x = min(min(value[b, under, c], value[b, over, c]) + e01, x)
+        x = min(
+            min(min(value[b, under, p], value[b, under, q]), min(value[b, over, p], value[b, over, q])) + e11,
+            x,
+        )
+        p = c - two
+        q = c + two
+        x = min(min(value[b, level, p], value[b, level, q]) + e20, x)
+        x = min(
+            min(min(value[b, under, p], value[b, under, q]), min(value[b, over, p], value[b, over, q])) + e21,
+            x,
+        )
+        value[to, level, c] = x if x + least * bends[layer, column + k] <= limit else np.inf
+
+
+@compiled
+def _pay(
+    sight: Sight,
+    lattice: Lattice,
+    below: int,
+    prices: Prices,
+    query: Query,
+    bench: Bench,
+    s: int,
+    window: tuple[int, int, int, int],
+    weight: float,
+    limit: float,
+) -> tuple[int, int, int, int]:
+    """Add places' own prices to those of getting there; what then is beyond the limit becomes infinite.
+
+    Returns the smallest window (first and last layer, first and last cell) around what is left.
+    """
+    value, owns, bends = bench.value, bench.own, bench.bend
+    mean, last = query.mean, query.last
+    here_count, missing, known = sight.here_count, sight.missing, sight.known
+    ahead = weight * bench.ahead[s]
+    step = lattice.step_m
+    f = lattice.fine * s
+    # What lies far ahead may be thought over again; what is near has been decided.
+    keep = prices.keep * (1.0 - s / lattice.stations)
+    v_low, v_high, c_low, c_high = window
+    v0 = v_high + 1
+    v1 = v_low - 1
+    c0 = c_high + 1
+    c1 = c_low - 1
+    for v in range(v_low, v_high + 1):
+        up = (v - below) * lattice.layer_m
+        for c in range(c_low, c_high + 1):
+            there = value[s, LAYER_HALO + v, HALO + c]
+            if not there < np.inf:
+                continue
+            bend = bends[v, c]
+            left = (c - lattice.half) * lattice.cell_m
+            own = 0.0
+            for i in range(query.first, query.stop):
+                own += step * _own_price(left, up, bend, mean, last, i, f, query.shape, keep, prices)
+            if there + own + ahead * bend > limit:
+                value[s, LAYER_HALO + v, HALO + c] = np.inf
+                continue
+            owns[v, c] = own
+            v0 = min(v0, v)
+            v1 = v
+            c0 = min(c0, c)
+            c1 = max(c1, c)
+    anything = query.crowded and s > 0
+    for i in range(query.first, query.stop):
+        if here_count[i, s] == 0:
+            continue
+        anything = True
+        for v in range(v0, v1 + 1):
+            if c0 < known[i, s, v, 0] or c1 > known[i, s, v, 1]:
+                cover(sight, i, lattice, below, s, v, v1, c0, c1)
+                break
+    if not anything:
+        for v in range(v0, v1 + 1):
+            for c in range(c0, c1 + 1):
+                if value[s, LAYER_HALO + v, HALO + c] < np.inf:
+                    value[s, LAYER_HALO + v, HALO + c] += owns[v, c]
+        return v0, v1, c0, c1
+    v_low, v_high, c_low, c_high = v0, v1, c0, c1
+    v0 = v_high + 1
+    v1 = v_low - 1
+    c0 = c_high + 1
+    c1 = c_low - 1
+    for v in range(v_low, v_high + 1):
+        for c in range(c_low, c_high + 1):
+            there = value[s, LAYER_HALO + v, HALO + c]
+            if not there < np.inf:
+                continue
+            own = owns[v, c]
+            for i in range(query.first, query.stop):
+                if here_count[i, s] > 0 and missing[i, s, v, c] > 0.0:
+                    own += step * missing_price(missing[i, s, v, c], prices)
+            there += own
+            rest = ahead * bends[v, c]
+            if query.crowded and s > 0 and there + rest <= limit:
+                there += _apart_price(sight, lattice, below, prices.apart, query, s, v, c)
+            if there + rest > limit:
+                value[s, LAYER_HALO + v, HALO + c] = np.inf
+                continue
+            value[s, LAYER_HALO + v, HALO + c] = there
+            v0 = min(v0, v)
+            v1 = v
+            c0 = min(c0, c)
+            c1 = max(c1, c)
+    return v0, v1, c0, c1
+
+
+@compiled
+def search_within(
+    sight: Sight,
+    lattice: Lattice,
+    below: int,
+    lowest: int,
+    highest: int,
+    prices: Prices,
+    query: Query,
+    bench: Bench,
+    edge: Array,
+    start_cell: int,
+    start_layer: int,
+    limit: float,
+    profile: Array,
+) -> float:
+    """Cheapest profile from a place at station 0 if it costs no more than a limit, else infinity.
+
+    It keeps to the layers lowest ... highest. Steps of up to two cells and one layer a station; on the spot
+    any number if ``query.aside`` is not negative. The profile (station, 2) gets offsets to the left and up
+    [m]. Returns its price.
+    """
+    cells = 2 * lattice.half + 1
+    weight = float(query.stop - query.first)
+    value = bench.value
+    if query.aside >= 0.0:
+        window = (lowest, highest, 0, cells - 1)
+    else:
+        window = (start_layer, start_layer, start_cell, start_cell)
+    _clear(value, 0, window)
+    for v in range(window[0], window[1] + 1):
+        for c in range(window[2], window[3] + 1):
+            value[0, LAYER_HALO + v, HALO + c] = 0.0
+    window = _pay(sight, lattice, below, prices, query, bench, 0, window, weight, np.inf)
+    if query.aside >= 0.0:
+        aside = weight * query.aside
+        _spread(
+            value[0],
+            lowest,
+            highest,
+            cells,
+            start_cell,
+            start_layer,
+            aside * lattice.cell_m,
+            aside * lattice.layer_m,
+        )
+    for s in range(1, lattice.stations):
+        if window[1] < window[0]:
+            return np.inf
+        window = (
+            max(lowest, window[0] - 1), min(highest, window[1] + 1),
+            max(0, window[2] - 2), min(cells - 1, window[3] + 2),
+        )  # fmt: skip
+        _clear(value, s, window)
+        least = weight * (lattice.step_m * prices.path + bench.ahead[s])
+        for v in range(window[0], window[1] + 1):
+            _relax(value, bench.bend, s, v, window[2], window[3], edge, least, limit)
+        window = _pay(sight, lattice, below, prices, query, bench, s, window, weight, limit)
+    best = np.inf
+    c_end = start_cell
+    v_end = start_layer
+    for c in range(window[2], window[3] + 1):
+        for v in range(window[0], window[1] + 1):
+            if value[lattice.stations - 1, LAYER_HALO + v, HALO + c] < best:
+                best = value[lattice.stations - 1, LAYER_HALO + v, HALO + c]
+                c_end = c
+                v_end = v
+    if best < np.inf:
+        _trace(value, lattice, below, edge, c_end, v_end, profile)
+    return best
+
+
+@compiled
+def _clear(value: Array, s: int, window: tuple[int, int, int, int]) -> None:
+    """Make a window and its surroundings infinite."""
+    v0, v1, c0, c1 = window
+    to = np.uint64(s)
+    first = np.uint64(c0)
+    for v in range(v0, v1 + 2 * LAYER_HALO + 1):
+        row = np.uint64(v)
+        for c in range(np.uint64(c1 - c0 + 2 * HALO + 1)):
+            value[to, row, first + c] = np.inf
+
+
+@compiled
+def _trace(
+    value: Array, lattice: Lattice, below: int, edge: Array, cell: int, layer: int, profile: Array
+) -> None:
+    """Write the profile that ends in a place: back from station to station the way that was cheapest."""
+    c = cell
+    v = layer
+    for s in range(lattice.stations - 1, -1, -1):
+        profile[s, 0] = (c - lattice.half) * lattice.cell_m
+        profile[s, 1] = (v - below) * lattice.layer_m
+        if s == 0:
+            return
+        best = np.inf
+        from_c = c
+        from_v = v
+        for dc in range(-2, 3):
+            for dv in range(-1, 2):
+                price = value[s - 1, LAYER_HALO + v - dv, HALO + c - dc] + edge[abs(dc), abs(dv)]
+                if price < best:
+                    best = price
+                    from_c = c - dc
+                    from_v = v - dv
+        c = from_c
+        v = from_v
 
 
 @compiled
 def cheapest_profile(
-    node: Array,
-    start_cell: int,
-    start_layer: int,
+    sight: Sight,
     lattice: Lattice,
     below: int,
-    slope_price: float,
-    steep_slope: float,
-    aside: float,
-    value: Array,
-    back: NDArray[np.int8],
+    layers: int,
+    prices: Prices,
+    query: Query,
+    bench: Bench,
+    offset: Array,
     profile: Array,
 ) -> float:
-    """Cheapest profile through node prices (station, cell, layer) from a place at station 0.
+    """Cheapest profile (station, 2) from where a UAV is, or the nearest place that the lattice knows.
 
-    Steps of up to two cells and one layer a station; on the spot any number if ``aside`` is not negative,
-    which is their price per metre. Scratch: ``value`` (2, cell, layer), ``back`` as the node prices. The
-    profile (station, 2) gets offsets to the left and up [m]. Returns its price.
+    Returns its price.
     """
-    stations, cells, layers = node.shape
-    value[:] = np.inf
-    value[0, start_cell, start_layer] = node[0, start_cell, start_layer]
-    low_c = high_c = start_cell
-    now = 0
-    if aside >= 0.0:
-        _spread(node[0], start_cell, start_layer, aside * lattice.cell_m, aside * lattice.layer_m, value[0])
-        low_c = 0
-        high_c = cells - 1
-    edge = np.empty((5, 3))
-    for dc in range(-2, 3):
-        for dv in range(-1, 2):
-            square = (dc * lattice.cell_m) ** 2 + (dv * lattice.layer_m) ** 2
-            factor = steep(np.sqrt(square) / lattice.step_m, steep_slope)
-            edge[dc + 2, dv + 1] = slope_price * factor * square / lattice.step_m
-    for s in range(1, stations):
-        low_c = max(0, low_c - 2)
-        high_c = min(cells - 1, high_c + 2)
-        for c in range(low_c, high_c + 1):
-            for v in range(layers):
-                best = np.inf
-                way = 7
-                for dc in range(max(-2, c - cells + 1), min(2, c) + 1):
-                    for dv in range(max(-1, v - layers + 1), min(1, v) + 1):
-                        price = value[now, c - dc, v - dv] + edge[dc + 2, dv + 1]
-                        if price < best:
-                            best = price
-                            way = 3 * (dc + 2) + dv + 1
-                value[1 - now, c, v] = best + node[s, c, v]
-                back[s, c, v] = way
-        now = 1 - now
-    best = np.inf
-    c_end = start_cell
-    v_end = start_layer
-    for c in range(low_c, high_c + 1):
-        for v in range(layers):
-            if value[now, c, v] < best:
-                best = value[now, c, v]
-                c_end = c
-                v_end = v
-    c = c_end
-    v = v_end
-    for s in range(stations - 1, -1, -1):
-        profile[s, 0] = (c - lattice.half) * lattice.cell_m
-        profile[s, 1] = (v - below) * lattice.layer_m
-        if s > 0:
-            way = back[s, c, v]
-            c -= way // 3 - 2
-            v -= way % 3 - 1
-    return best
+    weight = float(query.stop - query.first)
+    c = min(max(round(offset[0] / lattice.cell_m) + lattice.half, 0), 2 * lattice.half)
+    v = min(max(round(offset[1] / lattice.layer_m) + below, 0), layers - 1)
+    edge = np.empty((3, 2))
+    _edge_prices(lattice, weight * prices.slope, prices.steep, edge)
+    # What was flown last is a way as well, or near to one.
+    wanted = query.last[query.first] if query.stop - query.first == 1 else query.mean
+    known = price_of(sight, lattice, below, layers, prices, query, bench.bend, edge, c, v, wanted)
+    # Sums are rounded: a little above the price of a profile that is there.
+    known += 1e-9 * known + 1e-9
+    if layers > 1 and v == below and known > FIRST_GUESS * weight:
+        level = search_within(
+            sight, lattice, below, below, below, prices, query, bench, edge, c, v, known, profile
+        )
+        known = min(known, level + 1e-9 * level)
+    limit = FIRST_GUESS * weight if layers > 1 else known
+    while limit < 0.5 * known:
+        price = search_within(
+            sight, lattice, below, 0, layers - 1, prices, query, bench, edge, c, v, limit, profile
+        )
+        if price < np.inf:
+            return price
+        limit *= 4.0
+    return search_within(
+        sight, lattice, below, 0, layers - 1, prices, query, bench, edge, c, v, known, profile
+    )

@@ -7,6 +7,7 @@ one is kept: a lone obstacle moves one UAV, a wall moves all.
 
 from __future__ import annotations
 
+import threading
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
 from napf_mpc.planners.guide_band import (
-    WIDTH,
+    Band,
     add_neighbour,
     add_row,
     add_solids,
@@ -23,14 +24,29 @@ from napf_mpc.planners.guide_band import (
     smooth_terms,
     solve_band,
 )
-from napf_mpc.planners.guide_clearance import Frame, SolidBoxes, gather, largest_reach, vertical_room
+from napf_mpc.planners.guide_clearance import (
+    COLUMNS,
+    Frame,
+    Sight,
+    SolidBoxes,
+    gather,
+    largest_reach,
+    look,
+    vertical_room,
+)
 from napf_mpc.planners.guide_lattice import (
+    HALO,
+    LAYER_HALO,
+    Bench,
     Lattice,
     Prices,
+    Query,
+    any_short,
+    bend_offsets,
     cheapest_profile,
-    fill_missing,
-    node_neighbour,
-    node_prices,
+    cover,
+    list_here,
+    price_ahead,
 )
 from napf_mpc.world.distance import Solids
 
@@ -94,18 +110,87 @@ def _refine(coarse: Array, every: int, fine: Array) -> None:
 
 
 @compiled
-def _tight(short: Array, offset: Array, last: Array, lattice: Lattice, below: int) -> bool:
+def _blocked(sight: Sight, i: int, lattice: Lattice, below: int) -> bool:
+    """Whether anything is short on a UAV's lane."""
+    for s in range(lattice.stations):
+        if sight.here_count[i, s] == 0:
+            continue
+        cover(sight, i, lattice, below, s, below, below, lattice.half, lattice.half)
+        if sight.missing[i, s, below, lattice.half] > 0.0:
+            return True
+    return False
+
+
+@compiled
+def _tight(
+    sight: Sight, i: int, offset: Array, last: Array, lattice: Lattice, below: int, layers: int
+) -> bool:
     """Whether something is short over the next metres between the UAV, its lane and its last profile."""
-    layer = min(max(round(offset[1] / lattice.layer_m) + below, 0), short.shape[2] - 1)
+    layer = min(max(round(offset[1] / lattice.layer_m) + below, 0), layers - 1)
     low = min(offset[0], min(last[0], 0.0)) - 1.0
     high = max(offset[0], max(last[0], 0.0)) + 1.0
     c0 = max(0, int(np.floor(low / lattice.cell_m)) + lattice.half)
     c1 = min(2 * lattice.half, int(np.ceil(high / lattice.cell_m)) + lattice.half)
+    if c1 < c0:
+        return False
     for s in range(int(np.ceil(TIGHT_M / lattice.step_m))):
+        if sight.here_count[i, s] == 0:
+            continue
+        cover(sight, i, lattice, below, s, layer, layer, c0, c1)
         for c in range(c0, c1 + 1):
-            if short[s, c, layer] > 0.0:
+            if sight.missing[i, s, layer, c] > 0.0:
                 return True
     return False
+
+
+class Scratch(NamedTuple):
+    """What planning one run after the other writes over."""
+
+    found: NDArray[np.int64]
+    solid_count: NDArray[np.int64]
+    reach: Array
+    turned: Array
+    near: Array
+    here: NDArray[np.int64]
+    here_count: NDArray[np.int64]
+    missing: Array
+    known: NDArray[np.int64]
+    bench: Bench
+    band: Band
+
+
+def make_scratch(uavs: int, fine: int, most: int, search: Search) -> Scratch:
+    """Scratch for runs of so many UAVs that see so many solids each, with room for both lattices."""
+    first = search.lattice
+    wide = search.wide
+    stations = max(first.stations, wide.stations)
+    cells = 2 * max(first.half, wide.half) + 1
+    layers = 1 + max(max(first.layers, first.sphere_layers), max(wide.layers, wide.sphere_layers))
+    return Scratch(
+        np.empty((uavs, most), dtype=np.int64),
+        np.empty(uavs, dtype=np.int64),
+        np.empty(uavs),
+        np.empty((uavs, 3, 3)),
+        np.empty((uavs, most, COLUMNS)),
+        np.empty((uavs, stations, most), dtype=np.int64),
+        np.empty((uavs, stations), dtype=np.int64),
+        np.empty((uavs, stations, layers, cells)),
+        np.empty((uavs, stations, layers, 2), dtype=np.int64),
+        Bench(
+            np.empty((stations, layers + 2 * LAYER_HALO, cells + 2 * HALO)),
+            np.empty((layers, cells)),
+            np.empty((layers, cells)),
+            np.empty(stations),
+        ),
+        Band(
+            np.empty((fine, 3)),
+            np.empty(fine),
+            np.empty(fine),
+            np.empty((fine, 2)),
+            np.empty((fine, 3)),
+            np.empty((fine, 4)),
+        ),
+    )
 
 
 @compiled
@@ -125,6 +210,7 @@ def plan_run(
     search: Search,
     profiles: Array,
     missing: Array,
+    scratch: Scratch,
 ) -> bool:
     """Plan the profiles of one run's UAVs.
 
@@ -150,6 +236,8 @@ def plan_run(
         Settings.
     profiles, missing : array, shape (uav, station, 2), (uav, station)
         Written: profiles, and their shortfalls [m].
+    scratch : Scratch
+        Written over.
 
     Returns
     -------
@@ -167,9 +255,7 @@ def plan_run(
     step = lattice.step_m / lattice.fine
     span = lattice.half * lattice.cell_m
     ahead = (lattice.stations - 1) * lattice.step_m
-    found = np.empty((uavs, MOST_SOLIDS), dtype=np.int64)
-    count = np.empty(uavs, dtype=np.int64)
-    reach = np.empty(uavs)
+    found, count, reach = scratch.found, scratch.solid_count, scratch.reach
     upwards = False
     downwards = True
     for i in range(uavs):
@@ -188,10 +274,11 @@ def plan_run(
     layers = 1
     if upwards:
         layers += 2 * below if downwards else lattice.layers
-    cells = 2 * lattice.half + 1
-    zero = np.zeros((fine, 2))
     mean = np.empty((fine, 2))
-    short = np.zeros((uavs, lattice.stations, cells, layers))
+    sight = Sight(
+        solids, frame, search.k, need, along, lanes, covariance, scratch.turned, reach, found, count,
+        scratch.near, scratch.here, scratch.here_count, scratch.missing, scratch.known,
+    )  # fmt: skip
     in_the_way = 0
     moved = False
     is_short = np.zeros(uavs, dtype=np.bool_)
@@ -201,28 +288,26 @@ def plan_run(
         for s in range(fine):
             moved = moved or abs(last[i, s, 0]) > 1e-3 or abs(last[i, s, 1]) > 1e-3
     for i in range(uavs):
+        look(sight, boxes, i)
+        list_here(sight, i, lattice)
         if count[i] == 0:
             continue
-        is_short[i] = fill_missing(
-            solids, boxes, found[i], count[i], frame, along[i], lanes[i], covariance[i], search.k, need,
-            reach[i], lattice, below, short[i],
-        )  # fmt: skip
+        blocked = _blocked(sight, i, lattice, below)
+        is_short[i] = blocked or any_short(sight, i, lattice, below, layers)
         if is_short[i]:
-            blocked = False
-            for s in range(lattice.stations):
-                blocked = blocked or short[i, s, lattice.half, below] > 0.0
             in_the_way += blocked
             away[i] = blocked
             for s in range(fine):
                 away[i] = away[i] or abs(last[i, s, 0]) > AWAY_M or abs(last[i, s, 1]) > AWAY_M
-            tight[i] = _tight(short[i], offset[i], last[i, 0], lattice, below)
+            tight[i] = _tight(sight, i, offset[i], last[i, 0], lattice, below, layers)
     if in_the_way == 0 and not moved:
         profiles[:] = 0.0
         missing[:] = 0.0
         return False
-    node = np.empty((lattice.stations, cells, layers))
-    value = np.empty((2, cells, layers))
-    back = np.empty((lattice.stations, cells, layers), dtype=np.int8)
+    bench = scratch.bench
+    band = scratch.band
+    bend_offsets(lattice, below, layers, prices, bench.bend)
+    price_ahead(lattice, prices.path, prices.slope, bench.ahead)
     coarse = np.zeros((uavs, lattice.stations, 2))
     mean_profile(last, mean)
     draft_mean = np.empty((fine, 2))
@@ -231,30 +316,25 @@ def plan_run(
     trial = np.empty((uavs, fine, 2))
     drafts = np.empty((uavs, fine, 2))
     trial_missing = np.empty((uavs, fine))
-    matrix = np.empty((2 * fine, WIDTH))
-    right = np.empty(2 * fine)
     for draft in range(2):
         draft_mean[:] = mean
         if draft == 1:
-            if in_the_way < 2:
+            if in_the_way < 2 or missing.max() <= prices.spare_m:
+                # One way for all never was cheaper where each had found its own.
                 break
-            node[:] = 0.0
             middle = np.zeros(2)
             for i in range(uavs):
-                node_prices(short[i], 1.0, zero, last[i], 0.0, lattice, below, prices, node)
                 middle += offset[i] / uavs
-            _search(node, middle, lattice, below, prices, float(uavs), aside, value, back, coarse[0])
+            query = Query(0, uavs, 0.0, mean, last, coarse, separation, False, aside)
+            cheapest_profile(sight, lattice, below, layers, prices, query, bench, middle, coarse[0])
             _refine(coarse[0], lattice.fine, draft_mean)
         for i in range(uavs):
             if away[i]:
-                node[:] = 0.0
-                node_prices(short[i], 1.0, draft_mean, last[i], prices.shape, lattice, below, prices, node)
+                crowded = False
                 for j in range(i):
-                    node_neighbour(
-                        along[i] - along[j], lanes[i] - lanes[j], separation[i, j], coarse[j], lattice,
-                        below, prices.apart, node,
-                    )  # fmt: skip
-                _search(node, offset[i], lattice, below, prices, 1.0, aside, value, back, coarse[i])
+                    crowded = crowded or abs(along[i] - along[j]) < separation[i, j]
+                query = Query(i, i + 1, prices.shape, draft_mean, last, coarse, separation, crowded, aside)
+                cheapest_profile(sight, lattice, below, layers, prices, query, bench, offset[i], coarse[i])
                 _refine(coarse[i], lattice.fine, trial[i])
                 for a in range(2):
                     start[i, a] = offset[i, a]
@@ -267,32 +347,26 @@ def plan_run(
         for _ in range(search.passes):
             mean_profile(trial, draft_mean)
             for i in range(uavs):
-                smooth_terms(trial[i], draft_mean, last[i], step, prices, matrix, right)
+                smooth_terms(trial[i], draft_mean, last[i], step, prices, band)
                 if tight[i]:
-                    add_row(matrix, right, 0, prices.start, 1.0, 0.0, start[i, 0])
-                    add_row(matrix, right, 0, prices.start, 0.0, 1.0, start[i, 1])
+                    add_row(band.own, band.right, 0, prices.start, 1.0, 0.0, start[i, 0])
+                    add_row(band.own, band.right, 0, prices.start, 0.0, 1.0, start[i, 1])
                 if is_short[i]:
-                    add_solids(
-                        solids, boxes, found[i], count[i], frame, along[i], lanes[i], covariance[i], search.k,
-                        need, reach[i], step, PUSH, drafts[i], trial[i], matrix, right,
-                    )  # fmt: skip
+                    add_solids(sight, i, step, PUSH, drafts[i], trial[i], band)
                 for j in range(uavs):
                     if j != i and abs(along[i] - along[j]) < separation[i, j]:
                         add_neighbour(
                             along[i] - along[j], lanes[i] - lanes[j], separation[i, j], trial[j], step,
-                            prices.apart, trial[i], matrix, right,
+                            prices.apart, trial[i], band,
                         )  # fmt: skip
-                solve_band(matrix, right, 2 * fine)
+                solve_band(band)
                 for s in range(fine):
                     for a in range(2):
                         # A longer step could jump across what the draft goes round.
-                        change = right[2 * s + a] - trial[i, s, a]
+                        change = band.right[s, a] - trial[i, s, a]
                         trial[i, s, a] += min(max(change, -search.pass_m), search.pass_m)
         for i in range(uavs):
-            exact_missing(
-                solids, boxes, found[i], count[i], frame, along[i], lanes[i], covariance[i], search.k, need,
-                reach[i], step, trial[i], trial_missing[i],
-            )  # fmt: skip
+            exact_missing(sight, i, step, trial[i], trial_missing[i])
         mean_profile(trial, draft_mean)
         price = band_price(trial, draft_mean, last, trial_missing, step, prices)
         if draft == 0 or price < search.shared_gain * best:
@@ -303,39 +377,53 @@ def plan_run(
 
 
 @compiled
-def _search(
-    node: Array,
+def _plan_runs(
+    solids: Solids,
+    boxes: SolidBoxes,
+    scene_start: NDArray[np.int64],
+    frame: Frame,
+    due: NDArray[np.bool_],
+    along: Array,
     offset: Array,
-    lattice: Lattice,
-    below: int,
-    prices: Prices,
-    weight: float,
-    aside: float,
-    value: Array,
-    back: NDArray[np.int8],
-    out: Array,
+    lanes: Array,
+    covariance: Array,
+    separation: Array,
+    last: Array,
+    stuck: NDArray[np.bool_],
+    search: Search,
+    profiles: Array,
+    missing: Array,
+    busy: NDArray[np.bool_],
+    scratch: Scratch,
 ) -> None:
-    """Cheapest profile from where a UAV is, or the nearest place that the lattice knows."""
-    cell = round(offset[0] / lattice.cell_m) + lattice.half
-    layer = round(offset[1] / lattice.layer_m) + below
-    cell = min(max(cell, 0), node.shape[1] - 1)
-    layer = min(max(layer, 0), node.shape[2] - 1)
-    cheapest_profile(
-        node,
-        cell,
-        layer,
-        lattice,
-        below,
-        weight * prices.slope,
-        prices.steep,
-        weight * aside,
-        value,
-        back,
-        out,
-    )
+    for r in range(along.shape[0]):
+        if not due[r]:
+            continue
+        scene = 0 if len(scene_start) == 2 else r
+        busy[r] = plan_run(
+            solids, boxes, scene_start[scene], scene_start[scene + 1], frame, along[r], offset[r], lanes,
+            covariance[r], separation[r], last[r], stuck[r], search, profiles[r], missing[r], scratch,
+        )  # fmt: skip
 
 
-@compiled
+class _Kept(threading.local):
+    """Scratch of this thread, kept from plan to plan: fresh memory would cost as much as the plan."""
+
+    def __init__(self) -> None:
+        self.key: tuple[object, ...] = ()
+        self.scratch: Scratch | None = None
+
+    def of(self, uavs: int, fine: int, most: int, search: Search) -> Scratch:
+        key = (uavs, fine, most, search.lattice, search.wide)
+        if self.scratch is None or key != self.key:
+            self.scratch = make_scratch(uavs, fine, most, search)
+            self.key = key
+        return self.scratch
+
+
+_KEPT = _Kept()
+
+
 def plan_all(
     solids: Solids,
     boxes: SolidBoxes,
@@ -354,15 +442,14 @@ def plan_all(
     missing: Array,
     busy: NDArray[np.bool_],
 ) -> None:
-    """Plan all runs that are due, each from its own scene and state alone."""
-    for r in range(along.shape[0]):
-        if not due[r]:
-            continue
-        scene = 0 if len(scene_start) == 2 else r
-        busy[r] = plan_run(
-            solids, boxes, scene_start[scene], scene_start[scene + 1], frame, along[r], offset[r], lanes,
-            covariance[r], separation[r], last[r], stuck[r], search, profiles[r], missing[r],
-        )  # fmt: skip
+    """Plan all runs that are due, each from its own scene and state alone; see :func:`plan_run`."""
+    largest = int(np.diff(scene_start).max(initial=0))
+    # Powers of two, so that scenes of different size share scratch.
+    most = min(MOST_SOLIDS, 1 << max(largest - 1, 1).bit_length())
+    _plan_runs(
+        solids, boxes, scene_start, frame, due, along, offset, lanes, covariance, separation, last, stuck,
+        search, profiles, missing, busy, _KEPT.of(profiles.shape[1], profiles.shape[2], most, search),
+    )  # fmt: skip
 
 
 @compiled

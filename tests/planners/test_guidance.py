@@ -13,7 +13,7 @@ from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guidance import Guidance
 from napf_mpc.planners.guide import Guide, Passage
-from napf_mpc.planners.guide_band import WIDTH, solve_band
+from napf_mpc.planners.guide_band import empty_band, solve_band
 from napf_mpc.planners.guide_settings import GuidanceSettings
 from napf_mpc.planners.guided_field import GuidedNapfPlanner
 from napf_mpc.planners.registry import make_planner
@@ -340,15 +340,22 @@ def test_guidance_needs_a_formation() -> None:
 
 
 def test_the_band_solver_solves() -> None:
+    """Blocks of two, the station before and the one before that, against a dense solution."""
     rng = np.random.default_rng(3)
-    n = 14
-    lower = np.tril(rng.normal(size=(n, n))) * (np.subtract.outer(range(n), range(n)) < WIDTH)
-    full = lower @ lower.T + np.eye(n)
-    band = np.zeros((n, WIDTH))
-    for j in range(n):
-        for d in range(min(j + 1, WIDTH)):
-            band[j, d] = full[j, j - d]
-    right = rng.normal(size=n)
-    wanted = np.linalg.solve(full, right)
-    solve_band(band, right, n)
-    np.testing.assert_allclose(right, wanted, rtol=1e-9, atol=1e-12)
+    stations = 14
+    band = empty_band(stations)
+    band.own[:] = rng.uniform(0.5, 1.0, (stations, 3)) + np.array([10.0, 10.0, 0.0])
+    band.one[1:] = rng.normal(size=stations - 1)
+    band.two[2:] = rng.normal(size=stations - 2)
+    band.right[:] = rng.normal(size=(stations, 2))
+    full = np.zeros((2 * stations, 2 * stations))
+    for s in range(stations):
+        left, up, between = band.own[s]
+        full[2 * s : 2 * s + 2, 2 * s : 2 * s + 2] = [[left, between], [between, up]]
+        for back, coupling in ((1, band.one[s]), (2, band.two[s])):
+            for a in range(2):
+                if s >= back:
+                    full[2 * s + a, 2 * (s - back) + a] = full[2 * (s - back) + a, 2 * s + a] = coupling
+    wanted = np.linalg.solve(full, band.right.ravel())
+    solve_band(band)
+    np.testing.assert_allclose(band.right.ravel(), wanted, rtol=1e-9, atol=1e-12)
