@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
 from napf_mpc.solvers.kernel_active_set import (
     LIMIT,
@@ -18,6 +18,7 @@ from napf_mpc.solvers.kernel_active_set import (
     WorkingSet,
     ascend,
     enter,
+    look,
     lower_bound,
     mark_open,
     polish,
@@ -27,18 +28,7 @@ from napf_mpc.solvers.kernel_active_set import (
     sums,
     working_set,
 )
-from napf_mpc.solvers.kernel_rows import (
-    GROUP,
-    GROUPS,
-    HIGH,
-    LOW,
-    ROWS,
-    USABLE,
-    WIDTH,
-    Y_HIGH,
-    Y_LOW,
-    RowTable,
-)
+from napf_mpc.solvers.kernel_rows import HIGH, LOW, W1, W2, WIDTH, RowPlaces, RowTable
 from napf_mpc.solvers.kernel_signals import Q, SignalMaps, read_signals, stationarity, sweep
 
 ROUGH, UNUSABLE = 3, 4
@@ -51,6 +41,8 @@ CLOSE = 1e-12
 """A correction of the signals smaller than this, over one or the bound it moves against, ends the rounds."""
 SOFTEST = 1e-3
 """A slack whose quadratic price is below this part of its rows' stiffness is solved by proximal steps."""
+SOFTEST_ALONE = 1e-9
+"""The same for a slack of one row without a linear price."""
 PROXIMAL_STEPS = 60
 """Proximal steps at most; each leaves at most a thousandth of the error."""
 GUESSED = 1e-9
@@ -80,8 +72,12 @@ class Room(NamedTuple):
     """(13 N,) signals of the optimum without rows."""
     signals: Array
     """(13 N,) signals by the kernel."""
+    plane: Array
+    """(13, N) the same memory."""
     exact: Array
     """(13 N,) signals by the sweep."""
+    exact_plane: Array
+    """(13, N) the same memory."""
     force: Array
     """(13 N,)."""
     loads: Array
@@ -93,34 +89,43 @@ class Room(NamedTuple):
     certificate: Array
     """(6,) residual and largest term: primal, dual, complementarity."""
     previous: Array
-    """(groups,) last slack of a group that needs proximal steps."""
+    """(soft groups,) last slack of a group that needs proximal steps."""
     extra: Array
-    """(groups,) what those add to its quadratic price; zero for all others."""
+    """(soft groups,) what those add to its quadratic price; zero for all others."""
+    was_open: NDArray[np.bool_]
+    """(soft groups,) groups open before a proximal step."""
+    row: Index
+    """(capacity,) members before it."""
+    side: Array
+    """(capacity,) their sides."""
 
 
 @compiled
-def make_room(stages: int, groups: int) -> Room:
+def make_room(stages: int, soft: int, capacity: int) -> Room:
     """Room for programs of a size."""
     signals, both = (STATES + 1) * stages, STATES + INPUTS
+    plane, exact = np.zeros((STATES + 1, stages)), np.zeros((STATES + 1, stages))
     return Room(
         np.zeros((stages, STATES)), np.zeros((stages, STATES)), np.zeros((stages, INPUTS)),
         np.zeros((stages, INPUTS)), np.zeros((stages, STATES)), np.zeros((stages, STATES)),
         np.zeros((stages, INPUTS)), np.zeros((stages, STATES)),
-        np.zeros(signals), np.zeros(signals), np.zeros(signals), np.zeros(signals),
+        np.zeros(signals), plane.reshape(signals), plane, exact.reshape(signals), exact, np.zeros(signals),
         np.zeros((stages, both)), np.zeros((stages, both)), np.zeros((stages, both)),
-        np.zeros(6), np.zeros(groups), np.zeros(groups),
+        np.zeros(6), np.zeros(soft), np.zeros(soft), np.zeros(soft, np.bool_),
+        np.zeros(capacity, np.int64), np.zeros(capacity),
     )  # fmt: skip
 
 
-@compiled
+@compiled_bare
 def unconstrained(maps: SignalMaps, room: Room, starts: Array, references: Array, at: int) -> bool:
     """Signals of the optimum without rows; return whether they are finite."""
     n = len(room.states)
     for k in range(n):
         for i in range(STATES):
             room.linear[k, i] = 0.0
-        for e in range(maps.begins[Q, k], maps.begins[Q, k + 1]):
-            room.linear[k, maps.row[e]] -= maps.value[e] * references[at, k, maps.column[e]]
+        for i in range(STATES):
+            for e in range(maps.begins[Q, k, i], maps.begins[Q, k, i + 1]):
+                room.linear[k, i] -= maps.value[e] * references[at, k, maps.column[e]]
     sweep(maps, starts, at, room.linear, room.push, False, room.feed, room.cost, room.states, room.inputs)
     read_signals(maps, room.states, room.inputs, room.base)
     finite = True
@@ -132,7 +137,7 @@ def unconstrained(maps: SignalMaps, room: Room, starts: Array, references: Array
     return finite
 
 
-@compiled
+@compiled_bare
 def under_load(
     maps: SignalMaps, program: Program, work: WorkingSet, room: Room, starts: Array, at: int
 ) -> None:
@@ -142,7 +147,7 @@ def under_load(
     for j in range(work.counter[WORKING]):
         row, weight = work.row[j], work.side[j] * work.mult[j]
         for d in range(WIDTH):
-            room.force[program.place[program.u, row, d]] += weight * program.number[program.u, row, d]
+            room.force[program.places.signal[d, row]] += weight * program.number[program.u, d, row]
     for k in range(len(room.pull)):
         for i in range(STATES):
             room.pull[k, i] = room.linear[k, i]
@@ -158,7 +163,7 @@ def under_load(
     read_signals(maps, room.states, room.inputs, room.exact)
 
 
-@compiled
+@compiled_bare
 def correct(program: Program, work: WorkingSet, room: Room) -> bool:
     """Move the base by what the kernel's signals are off; return whether it mattered to any row."""
     matters = False
@@ -168,7 +173,7 @@ def correct(program: Program, work: WorkingSet, room: Room) -> bool:
         gap = (
             bound
             - side * row_value(program, row, room.exact)
-            - work.slack[program.place[program.u, row, GROUP]]
+            - work.slack[program.places.group[row]]
         )
         matters = matters or abs(gap) > CLOSE * max(1.0, abs(bound))
     for i in range(len(room.base)):
@@ -178,14 +183,14 @@ def correct(program: Program, work: WorkingSet, room: Room) -> bool:
     return matters
 
 
-@compiled
+@compiled_bare
 def solve_rows(
     maps: SignalMaps, program: Program, work: WorkingSet, room: Room, starts: Array, at: int, limit: int
 ) -> int:
     """Optimum with rows from the working set as it is; states and inputs are in the room."""
     status = LIMIT
     for _ in range(ROUNDS):
-        status = ascend(program, maps, work, room.base, room.signals, limit)
+        status = ascend(program, maps, work, room.base, room.signals, room.plane, limit)
         if status != OPTIMAL:
             return status
         under_load(maps, program, work, room, starts, at)
@@ -198,92 +203,106 @@ def solve_rows(
     return status
 
 
-@compiled
+@compiled_bare
 def proximal(
     program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room
 ) -> bool:
     """Give slacks with next to no quadratic price one of their own; return whether there are any."""
-    any_soft = False
-    for g in range(table.size[u, GROUPS]):
+    soft, any_soft = table.price.shape[2], False
+    for g in range(soft):
         room.previous[g], room.extra[g] = 0.0, 0.0
-        work.w1[g], work.w2[g] = table.price[u, g, 0], table.price[u, g, 1]
-    for r in range(program.rows):
-        g = program.place[program.u, r, GROUP]
-        if g == table.price.shape[1] - 1:
+        work.w1[g], work.w2[g] = table.price[u, W1, g], table.price[u, W2, g]
+    for r in range(len(program.places.group)):
+        g = program.places.group[r]
+        if g >= soft:
             continue
         size = 0.0
         for d in range(WIDTH):
-            size += program.number[program.u, r, d] ** 2
+            size += program.number[program.u, d, r] ** 2
+        # A linear price, or a row that shares the slack, would drown in a slack so soft. A row alone without
+        # one yields, that is all.
+        alone = program.places.lonely[g] == 1 and table.price[u, W1, g] == 0.0
+        least = SOFTEST_ALONE if alone else SOFTEST
         # An upper bound of the row's own Gram entry first: it is cheap.
-        if table.price[u, g, 1] * size * 4.0 * maps.softest < SOFTEST:
+        if (
+            table.price[u, W2, g] * size * 4.0 * maps.softest < least
+            and (program.number[program.u, LOW, r] > -np.inf or program.number[program.u, HIGH, r] < np.inf)
+        ):
             give = 0.0
             for d in range(WIDTH):
                 for e in range(WIDTH):
-                    pair = maps.kernel[program.place[program.u, r, d], program.place[program.u, r, e]]
-                    give += program.number[program.u, r, d] * program.number[program.u, r, e] * pair
-            least = SOFTEST / give if give > 0.0 else 1.0
-            room.extra[g] = max(room.extra[g], least - table.price[u, g, 1])
+                    pair = maps.kernel[program.places.signal[d, r], program.places.signal[e, r]]
+                    give += program.number[program.u, d, r] * program.number[program.u, e, r] * pair
+            softest = least / give if give > 0.0 else 1.0
+            room.extra[g] = max(room.extra[g], softest - table.price[u, W2, g])
             any_soft = any_soft or room.extra[g] > 0.0
-    for g in range(table.size[u, GROUPS]):
-        work.w2[g] = table.price[u, g, 1] + room.extra[g]
+    for g in range(soft):
+        work.w2[g] = table.price[u, W2, g] + room.extra[g]
     return any_soft
 
 
-@compiled
+@compiled_bare
+def join(program: Program, maps: SignalMaps, work: WorkingSet, row: int, side: float) -> None:
+    """Make a row a member while there is room; the factor is not touched."""
+    if work.counter[WORKING] < len(work.row) - 2:
+        enter(program, maps, work, row, side)
+        work.member[row] += 1 if side > 0.0 else 2
+        work.counter[WORKING] += 1
+
+
+@compiled_bare
 def guess(
     program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, z: Array, y: Array, at: int
 ) -> bool:
     """Take the rows that push in a guess as members, and its slacks as open; return whether it is finite."""
+    lost = 0
     for i in range(z.shape[1]):
-        if not np.isfinite(z[at, i]):
-            return False
+        # NaN fails every comparison.
+        lost += not abs(z[at, i]) < np.inf
     for i in range(y.shape[1]):
-        if not np.isfinite(y[at, i]):
-            return False
-    for g in range(table.size[u, GROUPS]):
-        if work.w1[g] > 0.0 and z[at, table.put[u, g, 0]] > GUESSED:
+        lost += not abs(y[at, i]) < np.inf
+    if lost > 0:
+        return False
+    for g in range(table.price.shape[2]):
+        if work.w1[g] > 0.0 and z[at, program.places.slack_z[g]] > GUESSED:
             mark_open(work, g)
-    for r in range(program.rows):
-        for side in (1.0, -1.0):
-            bound = lower_bound(program, r, side)
-            pushing = -y[at, table.place[u, r, Y_LOW]] if side > 0.0 else y[at, table.place[u, r, Y_HIGH]]
-            if bound > -np.inf and pushing > GUESSED and work.counter[WORKING] < len(work.row) - 2:
-                enter(program, maps, work, r, side)
-                work.member[r] += 1 if side > 0.0 else 2
-                work.counter[WORKING] += 1
+    for r in range(len(program.places.group)):
+        if -y[at, program.places.y_low[r]] > GUESSED and program.number[program.u, LOW, r] > -np.inf:
+            join(program, maps, work, r, 1.0)
+        if y[at, program.places.y_high[r]] > GUESSED and program.number[program.u, HIGH, r] < np.inf:
+            join(program, maps, work, r, -1.0)
     return True
 
 
-@compiled
+@compiled_bare
 def again(program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room) -> bool:
     """Take a proximal step: prices from the slacks reached; return whether they had moved."""
     moved = False
-    for g in range(table.size[u, GROUPS]):
+    for g in range(table.price.shape[2]):
         if room.extra[g] > 0.0:
             reached = max(0.0, work.slack[g])
             off = room.extra[g] * abs(reached - room.previous[g])
-            moved = moved or off > CLOSE * max(1.0, table.price[u, g, 0])
+            moved = moved or off > CLOSE * max(1.0, table.price[u, W1, g])
             room.previous[g] = reached
     if not moved:
         return False
     count = work.counter[WORKING]
-    rows, sides = work.row[:count].copy(), work.side[:count].copy()
-    was_open = work.is_open.copy()
-    for g in range(table.size[u, GROUPS]):
-        work.w1[g] = table.price[u, g, 0] - room.extra[g] * room.previous[g]
-    reset(work, program.rows, table.size[u, GROUPS])
-    for g in range(table.size[u, GROUPS]):
-        if was_open[g] and not work.is_open[g]:
+    for j in range(count):
+        room.row[j], room.side[j] = work.row[j], work.side[j]
+    for g in range(table.price.shape[2]):
+        work.w1[g] = table.price[u, W1, g] - room.extra[g] * room.previous[g]
+        room.was_open[g] = work.is_open[g]
+    reset(work, table.price.shape[2])
+    for g in range(table.price.shape[2]):
+        if room.was_open[g] and not work.is_open[g]:
             mark_open(work, g)
     for j in range(count):
-        enter(program, maps, work, rows[j], sides[j])
-        work.member[rows[j]] += 1 if sides[j] > 0.0 else 2
-        work.counter[WORKING] += 1
+        join(program, maps, work, room.row[j], room.side[j])
     resume(program, work, room.base)
     return True
 
 
-@compiled
+@compiled_bare
 def certify(
     maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room,
     starts: Array, at: int, z: Array, y: Array,
@@ -301,66 +320,70 @@ def certify(
             y[at, k * STATES + i] = room.costates[k, i]
         for i in range(INPUTS):
             z[at, n * STATES + k * INPUTS + i] = room.inputs[k, i]
-    for g in range(table.size[u, GROUPS]):
+    for g in range(table.price.shape[2]):
         slack = max(0.0, work.slack[g])
-        w1, w2, total = table.price[u, g, 0], table.price[u, g, 1], work.total[g]
+        w1, w2, total = table.price[u, W1, g], table.price[u, W2, g], work.total[g]
         mult = 0.0 if work.is_open[g] and slack > 0.0 else max(0.0, w1 + w2 * slack - total)
-        z[at, table.put[u, g, 0]], y[at, table.put[u, g, 1]] = slack, -mult
-        out[2] = max(out[2], abs(w1 + w2 * slack - total - mult))
-        out[3] = max(out[3], w1, w2 * slack, total)
-        out[4] = max(out[4], mult * slack)
+        z[at, program.places.slack_z[g]], y[at, program.places.slack_y[g]] = slack, -mult
+        if total != 0.0 or slack > 0.0:
+            out[2] = max(out[2], abs(w1 + w2 * slack - total - mult))
+            out[3] = max(out[3], w1, w2 * slack, total)
+            out[4] = max(out[4], mult * slack)
         work.slack[g] = slack
-    for r in range(program.rows):
-        value, slack = row_value(program, r, room.exact), work.slack[program.place[program.u, r, GROUP]]
-        low, high = program.number[program.u, r, LOW], program.number[program.u, r, HIGH]
-        out[0] = max(out[0], low - value - slack, value - high - slack)
-        out[1] = max(out[1], abs(value))
+    for f in range(len(program.places.wide)):
+        look(program, work, f, room.exact_plane)
+        for k in range(n):
+            out[0] = max(out[0], work.miss[f, k])
+            out[1] = max(out[1], abs(work.value[f, k]))
     for j in range(work.counter[WORKING]):
         row, side, mult = work.row[j], work.side[j], work.mult[j]
         bound = lower_bound(program, row, side)
         gap = (
             bound
             - side * row_value(program, row, room.exact)
-            - work.slack[program.place[program.u, row, GROUP]]
+            - work.slack[program.places.group[row]]
         )
         out[4] = max(out[4], mult * abs(gap))
         out[5] = max(out[5], mult * abs(bound))
         if side > 0.0:
-            y[at, table.place[u, row, Y_LOW]] -= mult
+            y[at, program.places.y_low[row]] -= mult
         else:
-            y[at, table.place[u, row, Y_HIGH]] += mult
-    worst = 0.0
+            y[at, program.places.y_high[row]] += mult
+    lost = 0
+    for i in range(len(room.exact)):
+        # NaN would lose the comparisons.
+        lost += not abs(room.exact[i]) < np.inf
+    worst = 0.0 if lost == 0 else np.inf
     for e in range(0, 6, 2):
         relative = out[e] / max(1.0, out[e + 1])
-        # NaN would lose the comparison.
         worst = max(worst, relative) if relative < np.inf else np.inf
     return worst
 
 
-@compiled
-def clear_multipliers(program: Program, table: RowTable, u: int, y: Array, at: int) -> None:
+@compiled_bare
+def clear_multipliers(program: Program, y: Array, at: int) -> None:
     """Zero the multipliers of all rows before they are written again."""
-    for r in range(program.rows):
-        y[at, table.place[u, r, Y_LOW]], y[at, table.place[u, r, Y_HIGH]] = 0.0, 0.0
+    for r in range(len(program.places.group)):
+        y[at, program.places.y_low[r]], y[at, program.places.y_high[r]] = 0.0, 0.0
 
 
-@compiled
+@compiled_bare
 def solve_one(
-    maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room, starts: Array,
+    maps: SignalMaps, places: RowPlaces, table: RowTable, u: int, work: WorkingSet, room: Room, starts: Array,
     references: Array, at: int, warm: bool, guess_z: Array, guess_y: Array, guess_at: int,
     limit: int, z: Array, y: Array,
 ) -> int:  # fmt: skip
     """Solve program u of a table; return how it ended."""
-    if table.size[u, USABLE] == 0 or not unconstrained(maps, room, starts, references, at):
+    if table.sound[u] == 0 or not unconstrained(maps, room, starts, references, at):
         return UNUSABLE
-    program = Program(table.number, table.place, u, table.size[u, ROWS])
+    program = Program(table.number, table.plane, places, u)
     work.counter[STEPS] = 0
     for attempt in range(2):
         if attempt == 1:
             # The corrections of the first attempt go with its multipliers.
             unconstrained(maps, room, starts, references, at)
         softest = proximal(program, maps, table, u, work, room)
-        reset(work, program.rows, table.size[u, GROUPS])
+        reset(work, table.price.shape[2])
         guessed = warm and attempt == 0 and guess(program, maps, table, u, work, guess_z, guess_y, guess_at)
         if guessed:
             resume(program, work, room.base)
@@ -372,7 +395,7 @@ def solve_one(
                 status = solve_rows(maps, program, work, room, starts, at, limit)
         if status == OPTIMAL:
             if attempt == 1:
-                clear_multipliers(program, table, u, y, at)
+                clear_multipliers(program, y, at)
             if certify(maps, program, table, u, work, room, starts, at, z, y) <= EXACT:
                 return OPTIMAL
             status = ROUGH
@@ -381,9 +404,34 @@ def solve_one(
     return status
 
 
+@compiled_bare
+def solve_all(
+    maps: SignalMaps, places: RowPlaces, table: RowTable, programs: Index, work: WorkingSet, room: Room,
+    initial: Array, reference: Array, warm: bool, guess_z: Array, guess_y: Array, limit: int,
+    z: Array, y: Array, residuals: Array, ends: NDArray[np.int64], steps: Index,
+) -> None:  # fmt: skip
+    """Solve the programs one after the other; see :func:`solve_programs`."""
+    for u in range(len(programs)):
+        i = programs[u]
+        g = i if warm else 0
+        ends[i] = solve_one(
+            maps, places, table, u, work, room, initial, reference, i, warm, guess_z, guess_y, g, limit, z, y
+        )
+        if ends[i] != UNUSABLE:
+            steps[i] = work.counter[STEPS]
+        if ends[i] == OPTIMAL or ends[i] == ROUGH:
+            for e in range(3):
+                residuals[i, e] = room.certificate[2 * e]
+        else:
+            for e in range(z.shape[1]):
+                z[i, e] = np.nan
+            for e in range(y.shape[1]):
+                y[i, e] = np.nan
+
+
 @compiled
 def solve_programs(
-    maps: SignalMaps, table: RowTable, programs: Index, column: Array, gram: Array, factor: Array,
+    maps: SignalMaps, places: RowPlaces, table: RowTable, programs: Index, column: Array, gram: Array, factor: Array,
     initial: Array, reference: Array, warm: bool, guess_z: Array, guess_y: Array, limit: int,
     z: Array, y: Array, residuals: Array, ends: NDArray[np.int64], steps: Index,
 ) -> None:  # fmt: skip
@@ -393,6 +441,8 @@ def solve_programs(
     ----------
     maps : SignalMaps
         Model.
+    places : RowPlaces
+        Where their rows stand.
     table : RowTable
         Rows of the programs.
     programs : array of int, shape (programs of the table,)
@@ -414,22 +464,10 @@ def solve_programs(
     ends, steps : array of int, shape (batch,)
         How each program ended, and after how many steps.
     """
-    groups = table.price.shape[1]
-    work = working_set(column, gram, factor, table.number.shape[1], groups)
-    room = make_room(reference.shape[1], groups)
-    for u in range(len(programs)):
-        i = programs[u]
-        g = i if warm else 0
-        ends[i] = solve_one(
-            maps, table, u, work, room, initial, reference, i, warm, guess_z, guess_y, g, limit, z, y
-        )
-        if ends[i] != UNUSABLE:
-            steps[i] = work.counter[STEPS]
-        if ends[i] == OPTIMAL or ends[i] == ROUGH:
-            for e in range(3):
-                residuals[i, e] = room.certificate[2 * e]
-        else:
-            for e in range(z.shape[1]):
-                z[i, e] = np.nan
-            for e in range(y.shape[1]):
-                y[i, e] = np.nan
+    stages, shelves = table.plane.shape[3], table.shelves.shape[2]
+    work = working_set(column, gram, factor, table.plane.shape[2], shelves + 1, stages)
+    room = make_room(stages, shelves * stages, len(gram))
+    solve_all(
+        maps, places, table, programs, work, room, initial, reference, warm, guess_z, guess_y, limit,
+        z, y, residuals, ends, steps,
+    )  # fmt: skip

@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 from scipy.sparse.csgraph import connected_components
 
 from napf_mpc.constraints.constraint import SIGNALS
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, Index, QpError
 
 KINDS = tuple(SIGNALS)
@@ -30,6 +30,10 @@ FIRST = np.cumsum([0, *(len(SIGNALS[kind]) for kind in KINDS)])[:-1]
 """(4,) number of the first signal of each kind."""
 A, B, Q, R, CLOSED, GAIN, PULL, INVERSE, TO_GO = range(9)
 """Matrices of a stage: the model's; A - B K, K, H^-1 B' and H^-1; the optimal cost from its end on."""
+A_TURNED, B_TURNED, CLOSED_TURNED, GAIN_TURNED = range(9, 13)
+"""Transposes."""
+QUAD = 4
+"""Entries of a row come in fours, filled up with zeros: sums of four do not wait for each other."""
 NOISE = 1e-14
 """Entries of a weight below this part of what its diagonal allows are rounding."""
 LOOSE = 1e-13
@@ -45,12 +49,12 @@ Small = NDArray[np.uint32]
 class SignalMaps(NamedTuple):
     """A model as the compiled loops need it: matrices as lists of their entries, and the signal kernel."""
 
+    rows: Index
+    """(13,) rows of each matrix, see :data:`A` to :data:`GAIN_TURNED`."""
     begins: Index
-    """(9, N + 1) where the entries of each matrix and stage begin, see :data:`A` to :data:`TO_GO`."""
-    row: Small
-    """(entries,)."""
+    """(13, N, 13) where the entries of each matrix, stage and row begin, and where those of the last end."""
     column: Small
-    """(entries,) not decreasing within a stage, so that sums do not wait for each other."""
+    """(entries,)."""
     value: Array
     """(entries,)."""
     kernel: Array
@@ -104,7 +108,8 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
     at = (order[:, None] * n + np.arange(n)).ravel()
     chain_of = np.repeat(chain[order], n)
     pull = inverse @ model.b.transpose(t)
-    matrices = (model.a, model.b, model.q, model.r, closed, gain, pull, inverse, to_go)
+    turned = [m.transpose(t) for m in (model.a, model.b, closed, gain)]
+    matrices = (model.a, model.b, model.q, model.r, closed, gain, pull, inverse, to_go, *turned)
     return SignalMaps(
         *_entries(matrices),
         np.ascontiguousarray(kernel[np.ix_(at, at)]),
@@ -123,21 +128,29 @@ def _cleaned(weight: Array) -> Array:
     return np.where(np.abs(weight) <= NOISE * size[:, None] * size, 0.0, weight)
 
 
-def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Small, Small, Array]:
-    """Where each matrix and stage begins; row, column and value of all entries that are not zero."""
+def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Index, Small, Array]:
+    """Rows of each matrix; where each matrix, stage and row begins; entries that are not zero, and padding."""
     stages = len(matrices[0])
-    begins = np.empty((len(matrices), stages + 1), dtype=np.int64)
-    rows, columns, values, count = [], [], [], 0
+    begins = np.empty((len(matrices), stages, STATES + 1), dtype=np.int64)
+    columns, values, count = [], [], 0
     for which, matrix in enumerate(matrices):
-        # Column by column: the transpose's entries in order.
-        stage, column, row = np.nonzero(matrix.transpose(0, 2, 1))
-        begins[which] = count + np.searchsorted(stage, np.arange(stages + 1))
-        rows.append(row)
+        some = matrix != 0.0
+        # A matrix of fewer rows has empty ones behind its own.
+        wide = np.zeros((stages, STATES), dtype=np.int64)
+        wide[:, : matrix.shape[1]] = -(-some.sum(axis=2) // QUAD) * QUAD
+        ends = count + wide.cumsum().reshape(stages, STATES)
+        begins[which, :, 1:], begins[which, :, 0] = ends, ends[:, 0] - wide[:, 0]
+        size = int(wide.sum())
+        column, value = np.zeros(size, dtype=np.uint32), np.zeros(size)
+        stage, row, at = np.nonzero(some)
+        mine = begins[which, stage, row]
+        place = mine - count + np.arange(len(mine)) - np.searchsorted(mine, mine)
+        column[place], value[place] = at, matrix[stage, row, at]
         columns.append(column)
-        values.append(matrix[stage, row, column])
-        count += len(stage)
-    places = [np.concatenate(v).astype(np.uint32) for v in (rows, columns)]
-    return begins, places[0], places[1], np.concatenate(values)
+        values.append(value)
+        count += size
+    rows = np.array([matrix.shape[1] for matrix in matrices], dtype=np.int64)
+    return rows, begins, np.concatenate(columns), np.concatenate(values)
 
 
 def _inverse_root(hessian: Array, stage: int) -> Array:
@@ -186,7 +199,7 @@ def _chains(kernel: Array, stages: int) -> tuple[Index, Index]:
     return np.argsort(chain, kind="stable"), chain.astype(np.int64)
 
 
-@compiled
+@compiled_bare
 def add(
     maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
 ) -> None:
@@ -194,20 +207,18 @@ def add(
 
     Arrays come whole with indices: views of them are counted, which costs more than the sums.
     """
-    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
-        out[to, first + maps.row[e]] += sign * maps.value[e] * vector[at, maps.column[e]]
+    for r in range(maps.rows[which]):
+        total = 0.0
+        for e in range(max(maps.begins[which, k, r], 0), maps.begins[which, k, r + 1], QUAD):
+            one = maps.value[e] * vector[at, maps.column[e]]
+            two = maps.value[e + 1] * vector[at, maps.column[e + 1]]
+            three = maps.value[e + 2] * vector[at, maps.column[e + 2]]
+            four = maps.value[e + 3] * vector[at, maps.column[e + 3]]
+            total += (one + two) + (three + four)
+        out[to, first + r] += sign * total
 
 
-@compiled
-def add_turned(
-    maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
-) -> None:
-    """The same of the matrix's transpose."""
-    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
-        out[to, first + maps.column[e]] += sign * maps.value[e] * vector[at, maps.row[e]]
-
-
-@compiled
+@compiled_bare
 def sweep(
     maps: SignalMaps, starts: Array, at: int, pull: Array, push: Array, pushed: bool,
     feed: Array, cost: Array, states: Array, inputs: Array,
@@ -245,9 +256,9 @@ def sweep(
             add(maps, INVERSE, k, -1.0, push, k, feed, k, 0)
         if k == 0:
             break
-        add_turned(maps, CLOSED, k, 1.0, cost, k, cost, k - 1, 0)
+        add(maps, CLOSED_TURNED, k, 1.0, cost, k, cost, k - 1, 0)
         if pushed:
-            add_turned(maps, GAIN, k, -1.0, push, k, cost, k - 1, 0)
+            add(maps, GAIN_TURNED, k, -1.0, push, k, cost, k - 1, 0)
     for k in range(n):
         for m in range(INPUTS):
             inputs[k, m] = feed[k, m]
@@ -260,7 +271,7 @@ def sweep(
         add(maps, B, k, 1.0, inputs, k, states, k, 0)
 
 
-@compiled
+@compiled_bare
 def read_signals(maps: SignalMaps, states: Array, inputs: Array, signals: Array) -> None:
     """Write the signals (13 N,) of states (N, 12) and inputs (N, 4)."""
     for i in range(len(signals)):
@@ -268,7 +279,7 @@ def read_signals(maps: SignalMaps, states: Array, inputs: Array, signals: Array)
         signals[i] = states[k, target] if target < STATES else inputs[k, target - STATES]
 
 
-@compiled
+@compiled_bare
 def stationarity(
     maps: SignalMaps, starts: Array, at: int, states: Array, inputs: Array, cost: Array, linear: Array,
     force: Array, costates: Array, loads: Array, weighed: Array, carried: Array, out: Array,
@@ -316,9 +327,9 @@ def stationarity(
         add(maps, TO_GO, k, -1.0, states, k, costates, k, 0)
         add(maps, Q, k, 1.0, states, k, weighed, k, 0)
         if k + 1 < n:
-            add_turned(maps, A, k + 1, 1.0, costates, k + 1, carried, k, 0)
+            add(maps, A_TURNED, k + 1, 1.0, costates, k + 1, carried, k, 0)
         add(maps, R, k, 1.0, inputs, k, weighed, k, STATES)
-        add_turned(maps, B, k, 1.0, costates, k, carried, k, STATES)
+        add(maps, B_TURNED, k, 1.0, costates, k, carried, k, STATES)
         for i in range(STATES):
             left = weighed[k, i] + linear[k, i] + costates[k, i] - carried[k, i] - loads[k, i]
             out[2] = max(out[2], abs(left))
