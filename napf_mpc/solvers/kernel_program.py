@@ -45,6 +45,8 @@ SOFTEST_ALONE = 1e-9
 """The same for a slack of one row without a linear price."""
 PROXIMAL_STEPS = 60
 """Proximal steps at most; each leaves at most a thousandth of the error."""
+LOOK = 32
+"""Guessed multipliers looked at together: most are zero."""
 GUESSED = 1e-9
 """A guessed multiplier or slack above this means an active row or an open slack."""
 
@@ -208,31 +210,38 @@ def proximal(
     program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room
 ) -> bool:
     """Give slacks with next to no quadratic price one of their own; return whether there are any."""
-    soft, any_soft = table.price.shape[2], False
+    soft, stages, any_soft = table.price.shape[2], table.plane.shape[3], False
+    for g in range(soft):
+        work.w1[g], work.w2[g] = table.price[u, W1, g], table.price[u, W2, g]
     for g in range(soft):
         room.previous[g], room.extra[g] = 0.0, 0.0
-        work.w1[g], work.w2[g] = table.price[u, W1, g], table.price[u, W2, g]
-    for r in range(len(program.places.group)):
-        g = program.places.group[r]
-        if g >= soft:
+    for f in range(len(program.places.wide)):
+        shelf, lonely, near = program.places.shelf[f], program.places.lonely[f], 0
+        if shelf == table.shelves.shape[2]:
             continue
-        size = 0.0
-        for d in range(WIDTH):
-            size += program.number[program.u, d, r] ** 2
-        # A linear price, or a row that shares the slack, would drown in a slack so soft. A row alone without
-        # one yields, that is all.
-        alone = program.places.lonely[g] == 1 and table.price[u, W1, g] == 0.0
-        least = SOFTEST_ALONE if alone else SOFTEST
-        # An upper bound of the row's own Gram entry first: it is cheap.
-        if (
-            table.price[u, W2, g] * size * 4.0 * maps.softest < least
-            and (program.number[program.u, LOW, r] > -np.inf or program.number[program.u, HIGH, r] < np.inf)
-        ):
-            give = 0.0
+        for k in range(stages):
+            size = 0.0
+            for d in range(WIDTH):
+                size += table.plane[u, d, f, k] * table.plane[u, d, f, k]
+            # A linear price, or a row that shares the slack, would drown in a slack so soft. A row alone
+            # without one yields, that is all.
+            alone = lonely & (table.shelves[u, W1, shelf, k] == 0.0)
+            least = SOFTEST_ALONE if alone else SOFTEST
+            finite = (table.plane[u, LOW, f, k] > -np.inf) | (table.plane[u, HIGH, f, k] < np.inf)
+            # An upper bound of the row's own Gram entry first: it is cheap.
+            near += (table.shelves[u, W2, shelf, k] * size * 4.0 * maps.softest < least) & finite
+        if near == 0:
+            continue
+        for r in range(f * stages, f * stages + stages):
+            g, give = program.places.group[r], 0.0
+            alone = lonely & (table.price[u, W1, g] == 0.0)
+            if table.number[u, LOW, r] == -np.inf and table.number[u, HIGH, r] == np.inf:
+                continue
             for d in range(WIDTH):
                 for e in range(WIDTH):
                     pair = maps.kernel[program.places.signal[d, r], program.places.signal[e, r]]
-                    give += program.number[program.u, d, r] * program.number[program.u, e, r] * pair
+                    give += program.number[u, d, r] * program.number[u, e, r] * pair
+            least = SOFTEST_ALONE if alone else SOFTEST
             softest = least / give if give > 0.0 else 1.0
             room.extra[g] = max(room.extra[g], softest - table.price[u, W2, g])
             any_soft = any_soft or room.extra[g] > 0.0
@@ -266,11 +275,20 @@ def guess(
     for g in range(table.price.shape[2]):
         if work.w1[g] > 0.0 and z[at, program.places.slack_z[g]] > GUESSED:
             mark_open(work, g)
-    for r in range(len(program.places.group)):
-        if -y[at, program.places.y_low[r]] > GUESSED and program.number[program.u, LOW, r] > -np.inf:
-            join(program, maps, work, r, 1.0)
-        if y[at, program.places.y_high[r]] > GUESSED and program.number[program.u, HIGH, r] < np.inf:
-            join(program, maps, work, r, -1.0)
+    spans = program.places.span
+    for b in range(len(spans)):
+        for first in range(spans[b, 0], spans[b, 1], LOOK):
+            last, pushing = min(first + LOOK, spans[b, 1]), 0
+            for m in range(max(first, 0), last):
+                pushing += abs(y[at, m]) > GUESSED
+            if pushing == 0:
+                continue
+            for m in range(max(first, 0), last):
+                r = program.places.owner[m]
+                if -y[at, m] > GUESSED and program.number[program.u, LOW, r] > -np.inf:
+                    join(program, maps, work, r, 1.0)
+                if y[at, m] > GUESSED and program.number[program.u, HIGH, r] < np.inf:
+                    join(program, maps, work, r, -1.0)
     return True
 
 
@@ -320,35 +338,35 @@ def certify(
             y[at, k * STATES + i] = room.costates[k, i]
         for i in range(INPUTS):
             z[at, n * STATES + k * INPUTS + i] = room.inputs[k, i]
+    off, largest, product = out[2], out[3], out[4]
     for g in range(table.price.shape[2]):
         slack = max(0.0, work.slack[g])
         w1, w2, total = table.price[u, W1, g], table.price[u, W2, g], work.total[g]
         mult = 0.0 if work.is_open[g] and slack > 0.0 else max(0.0, w1 + w2 * slack - total)
         z[at, program.places.slack_z[g]], y[at, program.places.slack_y[g]] = slack, -mult
         if total != 0.0 or slack > 0.0:
-            out[2] = max(out[2], abs(w1 + w2 * slack - total - mult))
-            out[3] = max(out[3], w1, w2 * slack, total)
-            out[4] = max(out[4], mult * slack)
+            off = max(off, abs(w1 + w2 * slack - total - mult))
+            largest = max(largest, max(w1, max(w2 * slack, total)))
+            product = max(product, mult * slack)
         work.slack[g] = slack
+    out[2], out[3] = off, largest
+    missed, size = out[0], out[1]
     for f in range(len(program.places.wide)):
         look(program, work, f, room.exact_plane)
         for k in range(n):
-            out[0] = max(out[0], work.miss[f, k])
-            out[1] = max(out[1], abs(work.value[f, k]))
+            missed, size = max(missed, work.miss[f, k]), max(size, abs(work.value[f, k]))
+    out[0], out[1] = missed, size
+    largest = out[5]
     for j in range(work.counter[WORKING]):
         row, side, mult = work.row[j], work.side[j], work.mult[j]
         bound = lower_bound(program, row, side)
-        gap = (
-            bound
-            - side * row_value(program, row, room.exact)
-            - work.slack[program.places.group[row]]
-        )
-        out[4] = max(out[4], mult * abs(gap))
-        out[5] = max(out[5], mult * abs(bound))
+        gap = bound - side * row_value(program, row, room.exact) - work.slack[program.places.group[row]]
+        product, largest = max(product, mult * abs(gap)), max(largest, mult * abs(bound))
         if side > 0.0:
             y[at, program.places.y_low[row]] -= mult
         else:
             y[at, program.places.y_high[row]] += mult
+    out[4], out[5] = product, largest
     lost = 0
     for i in range(len(room.exact)):
         # NaN would lose the comparisons.

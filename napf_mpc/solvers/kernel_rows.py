@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from napf_mpc.constraints.constraint import SIGNALS
 from napf_mpc.jit import compiled
@@ -46,8 +47,12 @@ class RowPlaces(NamedTuple):
     """(soft group,) where its slack goes."""
     slack_y: Small
     """(soft group,) where the multiplier of the slack's sign goes."""
-    lonely: Index
-    """(soft group,) whether one row has the slack to itself."""
+    lonely: NDArray[np.bool_]
+    """(family,) whether each row has a slack to itself."""
+    owner: Small
+    """(multipliers,) row of each multiplier."""
+    span: Index
+    """(2 x blocks, 2) where the multipliers of the rows of each block and side begin and end."""
 
     @classmethod
     def of(cls, layout: Layout, place: Index) -> RowPlaces:
@@ -55,7 +60,7 @@ class RowPlaces(NamedTuple):
         n = layout.stages
         stage = np.arange(n)
         axis, wide, shelf, shelves = [], [], [], 0
-        y_low, y_high, slack_z, slack_y, lonely, y = [], [], [], [], [], STATES * n
+        y_low, y_high, slack_z, slack_y, lonely, span, y = [], [], [], [], [], [], STATES * n
         for (signal, count, per_stage, low, high), slacks in zip(layout.kinds, layout.slacks, strict=True):
             first, width = int(FIRST[KINDS.index(signal)]), len(SIGNALS[signal])
             copies = low + high if per_stage else 1
@@ -63,14 +68,16 @@ class RowPlaces(NamedTuple):
             for j in range(count):
                 axis.append([*place[first : first + width], *[place[first]] * (WIDTH - width)])
                 wide.append(width == WIDTH)
+                lonely.append(per_stage == count)
                 shelf.append(-1 if not per_stage else shelves + (j if per_stage == count else 0))
                 y_low.append(y + stage * count + j)
                 y_high.append(upper + stage * count + j)
-            y += copies * count * n
+            for _ in range(copies):
+                span.append((y, y + count * n))
+                y += count * n
             for s in range(per_stage):
                 slack_z.append(slacks.start + stage * per_stage + s)
                 slack_y.append(y + stage * per_stage + s)
-                lonely.append(np.full(n, per_stage == count))
             y, shelves = y + per_stage * n, shelves + per_stage
         axes = np.array(axis, dtype=np.int64).reshape(-1, WIDTH)
         rack = np.array(shelf, dtype=np.int64)
@@ -79,13 +86,18 @@ class RowPlaces(NamedTuple):
         def small(values: object) -> Small:
             return np.ascontiguousarray(np.array(values).ravel(), dtype=np.uint32)
 
+        owner = np.zeros(layout.sparsity.constraints, dtype=np.uint32)
+        rows = np.arange(len(axes) * n)
+        for places in (y_low, y_high):
+            owner[np.array(places, dtype=np.int64).ravel()] = rows
         return cls(
             np.ascontiguousarray((axes.T[:, :, None] * n + stage).reshape(WIDTH, -1), dtype=np.uint32),
             small(np.tile(stage, len(axes))),
             small(rack[:, None] * n + stage),
             small(y_low), small(y_high),
             axes.astype(np.uint32), np.array(wide, dtype=np.int64), small(rack),
-            small(slack_z), small(slack_y), np.array(lonely, dtype=np.int64).ravel(),
+            small(slack_z), small(slack_y), np.array(lonely, dtype=np.bool_),
+            owner, np.array(span, dtype=np.int64).reshape(-1, 2),
         )  # fmt: skip
 
 

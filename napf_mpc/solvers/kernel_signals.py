@@ -321,8 +321,7 @@ def stationarity(
             costates[k, i] = -cost[k, i]
     for i in range(len(force)):
         loads[maps.stage[i], maps.target[i]] += force[i]
-    for e in range(6):
-        out[e] = 0.0
+    gradient, largest = 0.0, 0.0
     for k in range(n - 1, -1, -1):
         add(maps, TO_GO, k, -1.0, states, k, costates, k, 0)
         add(maps, Q, k, 1.0, states, k, weighed, k, 0)
@@ -330,13 +329,16 @@ def stationarity(
             add(maps, A_TURNED, k + 1, 1.0, costates, k + 1, carried, k, 0)
         add(maps, R, k, 1.0, inputs, k, weighed, k, STATES)
         add(maps, B_TURNED, k, 1.0, costates, k, carried, k, STATES)
+    for k in range(n):
         for i in range(STATES):
             left = weighed[k, i] + linear[k, i] + costates[k, i] - carried[k, i] - loads[k, i]
-            out[2] = max(out[2], abs(left))
-            out[3] = max(out[3], abs(weighed[k, i]), abs(linear[k, i]), abs(costates[k, i]))
+            gradient = max(gradient, abs(left))
+            largest = max(largest, max(abs(weighed[k, i]), max(abs(linear[k, i]), abs(costates[k, i]))))
         for m in range(STATES, STATES + INPUTS):
-            out[2] = max(out[2], abs(weighed[k, m] - carried[k, m] - loads[k, m]))
-            out[3] = max(out[3], abs(weighed[k, m]), abs(loads[k, m]))
+            gradient = max(gradient, abs(weighed[k, m] - carried[k, m] - loads[k, m]))
+            largest = max(largest, max(abs(weighed[k, m]), abs(loads[k, m])))
+    out[2], out[3] = gradient, largest
+    off, size, product, most = 0.0, 0.0, 0.0, 0.0
     for k in range(n):
         # The other way round than in the sweep, and in place of what is no longer needed.
         for i in range(STATES):
@@ -346,9 +348,10 @@ def stationarity(
             add(maps, A, k, 1.0, starts, at, loads, k, 0)
         else:
             add(maps, A, k, 1.0, states, k - 1, loads, k, 0)
+    for k in range(n):
         for i in range(STATES):
             gap = abs(states[k, i] - loads[k, i])
-            out[0] = max(out[0], gap)
-            out[1] = max(out[1], abs(states[k, i]))
-            out[4] = max(out[4], gap * abs(costates[k, i]))
-            out[5] = max(out[5], abs(costates[k, i] * states[k, i]))
+            off, size = max(off, gap), max(size, abs(states[k, i]))
+            product = max(product, gap * abs(costates[k, i]))
+            most = max(most, abs(costates[k, i] * states[k, i]))
+    out[0], out[1], out[4], out[5] = off, size, product, most
