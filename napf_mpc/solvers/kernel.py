@@ -18,7 +18,7 @@ from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, solve_programs
 from napf_mpc.solvers.kernel_rows import RowPlaces, RowTable, gather
 from napf_mpc.solvers.kernel_signals import TARGETS, SignalMaps, signal_maps
 
-CHUNK = 64
+CHUNK = 32
 """Programs whose rows are gathered together: few enough to stay in the cache."""
 _STATUS = {
     OPTIMAL: QpStatus.SOLVED,

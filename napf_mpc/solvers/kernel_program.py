@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
 from napf_mpc.solvers.kernel_active_set import (
+    INFEASIBLE,
     LIMIT,
     OPTIMAL,
     STEPS,
@@ -29,12 +30,22 @@ from napf_mpc.solvers.kernel_active_set import (
     working_set,
 )
 from napf_mpc.solvers.kernel_rows import HIGH, LOW, W1, W2, WIDTH, RowPlaces, RowTable
-from napf_mpc.solvers.kernel_signals import Q, SignalMaps, read_signals, stationarity, sweep
+from napf_mpc.solvers.kernel_signals import SignalMaps
+from napf_mpc.solvers.kernel_sweep import (
+    Lanes,
+    clear,
+    make_lanes,
+    read_signals,
+    stationarity,
+    sweep,
+    take,
+)
 
-ROUGH, UNUSABLE = 3, 4
-"""Further ends of a program: the certificate is not met; a number is not sound."""
-EXACT = 1e-9
-"""Largest KKT residual of a solved program, over one or its own largest term."""
+ROUGH, UNUSABLE, ALONE = 3, 4, 5
+"""Further ends of a program: the certificate is not met; a number is not sound; it is to be solved alone."""
+EXACT, PLAIN = 1e-9, 1e-10
+"""Largest KKT residual of a solved program, over one or its own largest term; and of one that is solved
+without corrections."""
 ROUNDS = 4
 """Corrections of the signals by exact sweeps at most; one is the rule."""
 CLOSE = 1e-12
@@ -52,24 +63,8 @@ GUESSED = 1e-9
 
 
 class Room(NamedTuple):
-    """Arrays that one program needs beside its working set."""
+    """Arrays that one program needs beside its working set and its lane."""
 
-    linear: Array
-    """(N, 12) -Q ref."""
-    pull: Array
-    """(N, 12)."""
-    push: Array
-    """(N, 4)."""
-    feed: Array
-    """(N, 4)."""
-    cost: Array
-    """(N, 12)."""
-    states: Array
-    """(N, 12)."""
-    inputs: Array
-    """(N, 4)."""
-    costates: Array
-    """(N, 12)."""
     base: Array
     """(13 N,) signals of the optimum without rows."""
     signals: Array
@@ -80,14 +75,6 @@ class Room(NamedTuple):
     """(13 N,) signals by the sweep."""
     exact_plane: Array
     """(13, N) the same memory."""
-    force: Array
-    """(13 N,)."""
-    loads: Array
-    """(N, 16)."""
-    weighed: Array
-    """(N, 16)."""
-    carried: Array
-    """(N, 16)."""
     certificate: Array
     """(6,) residual and largest term: primal, dual, complementarity."""
     previous: Array
@@ -102,67 +89,69 @@ class Room(NamedTuple):
     """(capacity,) their sides."""
 
 
+class Kept(NamedTuple):
+    """Working sets of some programs while their plans are made side by side."""
+
+    end: Index
+    """(program,) how each ended so far, or :data:`ALONE`."""
+    steps: Index
+    """(program,)."""
+    count: Index
+    """(program,) members."""
+    row: Index
+    """(program, capacity)."""
+    side: Array
+    """(program, capacity)."""
+    mult: Array
+    """(program, capacity)."""
+    slack: Array
+    """(program, soft group)."""
+    total: Array
+    """(program, soft group)."""
+    is_open: NDArray[np.bool_]
+    """(program, soft group)."""
+
+
 @compiled
 def make_room(stages: int, soft: int, capacity: int) -> Room:
     """Room for programs of a size."""
-    signals, both = (STATES + 1) * stages, STATES + INPUTS
+    signals = (STATES + 1) * stages
     plane, exact = np.zeros((STATES + 1, stages)), np.zeros((STATES + 1, stages))
     return Room(
-        np.zeros((stages, STATES)), np.zeros((stages, STATES)), np.zeros((stages, INPUTS)),
-        np.zeros((stages, INPUTS)), np.zeros((stages, STATES)), np.zeros((stages, STATES)),
-        np.zeros((stages, INPUTS)), np.zeros((stages, STATES)),
-        np.zeros(signals), plane.reshape(signals), plane, exact.reshape(signals), exact, np.zeros(signals),
-        np.zeros((stages, both)), np.zeros((stages, both)), np.zeros((stages, both)),
+        np.zeros(signals), plane.reshape(signals), plane, exact.reshape(signals), exact,
         np.zeros(6), np.zeros(soft), np.zeros(soft), np.zeros(soft, np.bool_),
         np.zeros(capacity, np.int64), np.zeros(capacity),
     )  # fmt: skip
 
 
-@compiled_bare
-def unconstrained(maps: SignalMaps, room: Room, starts: Array, references: Array, at: int) -> bool:
-    """Signals of the optimum without rows; return whether they are finite."""
-    n = len(room.states)
-    for k in range(n):
-        for i in range(STATES):
-            room.linear[k, i] = 0.0
-        for i in range(STATES):
-            for e in range(maps.begins[Q, k, i], maps.begins[Q, k, i + 1]):
-                room.linear[k, i] -= maps.value[e] * references[at, k, maps.column[e]]
-    sweep(maps, starts, at, room.linear, room.push, False, room.feed, room.cost, room.states, room.inputs)
-    read_signals(maps, room.states, room.inputs, room.base)
-    finite = True
-    for i in range(len(room.base)):
-        finite = finite and np.isfinite(room.base[i])
-    for k in range(n):
-        for i in range(STATES):
-            finite = finite and np.isfinite(room.states[k, i])
-    return finite
+@compiled
+def make_kept(programs: int, soft: int, capacity: int) -> Kept:
+    """Room for so many programs."""
+    return Kept(
+        np.zeros(programs, np.int64), np.zeros(programs, np.int64), np.zeros(programs, np.int64),
+        np.empty((programs, capacity), np.int64), np.empty((programs, capacity)),
+        np.empty((programs, capacity)), np.empty((programs, soft)), np.empty((programs, soft)),
+        np.empty((programs, soft), np.bool_),
+    )  # fmt: skip
 
 
 @compiled_bare
-def under_load(
-    maps: SignalMaps, program: Program, work: WorkingSet, room: Room, starts: Array, at: int
-) -> None:
-    """States, inputs and exact signals under the working set's multipliers."""
-    for i in range(len(room.force)):
-        room.force[i] = 0.0
+def load(maps: SignalMaps, program: Program, work: WorkingSet, lanes: Lanes, lane: int) -> None:
+    """Put the working set's forces into a lane without any."""
     for j in range(work.counter[WORKING]):
         row, weight = work.row[j], work.side[j] * work.mult[j]
         for d in range(WIDTH):
-            room.force[program.places.signal[d, row]] += weight * program.number[program.u, d, row]
-    for k in range(len(room.pull)):
-        for i in range(STATES):
-            room.pull[k, i] = room.linear[k, i]
-        for i in range(INPUTS):
-            room.push[k, i] = 0.0
-    for i in range(len(room.force)):
-        k, target = maps.stage[i], maps.target[i]
-        if target < STATES:
-            room.pull[k, target] -= room.force[i]
-        else:
-            room.push[k, target - STATES] -= room.force[i]
-    sweep(maps, starts, at, room.pull, room.push, True, room.feed, room.cost, room.states, room.inputs)
-    read_signals(maps, room.states, room.inputs, room.exact)
+            i = program.places.signal[d, row]
+            lanes.loads[maps.stage[i], maps.target[i], lane] += weight * program.number[program.u, d, row]
+
+
+@compiled_bare
+def under_load(maps: SignalMaps, program: Program, work: WorkingSet, room: Room, lanes: Lanes) -> None:
+    """Plan and exact signals under the working set's multipliers, in the only lane."""
+    clear(lanes.loads)
+    load(maps, program, work, lanes, 0)
+    sweep(maps, lanes, True)
+    read_signals(maps, lanes, 0, room.exact)
 
 
 @compiled_bare
@@ -172,11 +161,7 @@ def correct(program: Program, work: WorkingSet, room: Room) -> bool:
     for j in range(work.counter[WORKING]):
         row, side = work.row[j], work.side[j]
         bound = lower_bound(program, row, side)
-        gap = (
-            bound
-            - side * row_value(program, row, room.exact)
-            - work.slack[program.places.group[row]]
-        )
+        gap = bound - side * row_value(program, row, room.exact) - work.slack[program.places.group[row]]
         matters = matters or abs(gap) > CLOSE * max(1.0, abs(bound))
     for i in range(len(room.base)):
         shift = room.exact[i] - room.signals[i]
@@ -187,21 +172,21 @@ def correct(program: Program, work: WorkingSet, room: Room) -> bool:
 
 @compiled_bare
 def solve_rows(
-    maps: SignalMaps, program: Program, work: WorkingSet, room: Room, starts: Array, at: int, limit: int
+    maps: SignalMaps, program: Program, work: WorkingSet, room: Room, lanes: Lanes, limit: int
 ) -> int:
-    """Optimum with rows from the working set as it is; states and inputs are in the room."""
+    """Optimum with rows from the working set as it is; the plan is in the only lane."""
     status = LIMIT
     for _ in range(ROUNDS):
         status = ascend(program, maps, work, room.base, room.signals, room.plane, limit)
         if status != OPTIMAL:
             return status
-        under_load(maps, program, work, room, starts, at)
+        under_load(maps, program, work, room, lanes)
         if not correct(program, work, room):
             break
         polish(program, work, room.exact)
     else:
         sums(program, work)
-        under_load(maps, program, work, room, starts, at)
+        under_load(maps, program, work, room, lanes)
     return status
 
 
@@ -322,22 +307,23 @@ def again(program: Program, maps: SignalMaps, table: RowTable, u: int, work: Wor
 
 @compiled_bare
 def certify(
-    maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room,
-    starts: Array, at: int, z: Array, y: Array,
+    program: Program, table: RowTable, u: int, work: WorkingSet, room: Room, lanes: Lanes, lane: int,
+    at: int, z: Array, y: Array,
 ) -> float:  # fmt: skip
-    """Write slacks, multipliers and residuals of the original program; return the largest relative one."""
-    out = room.certificate
-    stationarity(
-        maps, starts, at, room.states, room.inputs, room.cost, room.linear, room.force,
-        room.costates, room.loads, room.weighed, room.carried, out,
-    )  # fmt: skip
-    n = len(room.states)
+    """Write plan, slacks, multipliers and residuals of the original program; return the largest relative one.
+
+    The lane's plan must be in balance, see :func:`~napf_mpc.solvers.kernel_sweep.stationarity`, and its
+    signals in the room.
+    """
+    out, n = room.certificate, lanes.states.shape[0]
+    for e in range(6):
+        out[e] = lanes.balance[e, lane]
     for k in range(n):
         for i in range(STATES):
-            z[at, k * STATES + i] = room.states[k, i]
-            y[at, k * STATES + i] = room.costates[k, i]
+            z[at, k * STATES + i] = lanes.states[k, i, lane]
+            y[at, k * STATES + i] = lanes.costates[k, i, lane]
         for i in range(INPUTS):
-            z[at, n * STATES + k * INPUTS + i] = room.inputs[k, i]
+            z[at, n * STATES + k * INPUTS + i] = lanes.inputs[k, i, lane]
     off, largest, product = out[2], out[3], out[4]
     for g in range(table.price.shape[2]):
         slack = max(0.0, work.slack[g])
@@ -367,11 +353,7 @@ def certify(
         else:
             y[at, program.places.y_high[row]] += mult
     out[4], out[5] = product, largest
-    lost = 0
-    for i in range(len(room.exact)):
-        # NaN would lose the comparisons.
-        lost += not abs(room.exact[i]) < np.inf
-    worst = 0.0 if lost == 0 else np.inf
+    worst = 0.0 if lanes.lost[lane] == 0 else np.inf
     for e in range(0, 6, 2):
         relative = out[e] / max(1.0, out[e + 1])
         worst = max(worst, relative) if relative < np.inf else np.inf
@@ -386,35 +368,32 @@ def clear_multipliers(program: Program, y: Array, at: int) -> None:
 
 
 @compiled_bare
-def solve_one(
-    maps: SignalMaps, places: RowPlaces, table: RowTable, u: int, work: WorkingSet, room: Room, starts: Array,
-    references: Array, at: int, warm: bool, guess_z: Array, guess_y: Array, guess_at: int,
-    limit: int, z: Array, y: Array,
+def solve_alone(
+    maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room, lanes: Lanes,
+    at: int, warm: bool, guess_z: Array, guess_y: Array, guess_at: int, limit: int, z: Array, y: Array,
 ) -> int:  # fmt: skip
-    """Solve program u of a table; return how it ended."""
-    if table.sound[u] == 0 or not unconstrained(maps, room, starts, references, at):
-        return UNUSABLE
-    program = Program(table.number, table.plane, places, u)
+    """Solve a program in the only lane, with corrections and proximal steps; return how it ended."""
     work.counter[STEPS] = 0
+    status = LIMIT
     for attempt in range(2):
-        if attempt == 1:
-            # The corrections of the first attempt go with its multipliers.
-            unconstrained(maps, room, starts, references, at)
+        # The corrections of the first attempt go with its multipliers.
+        sweep(maps, lanes, False)
+        read_signals(maps, lanes, 0, room.base)
         softest = proximal(program, maps, table, u, work, room)
         reset(work, table.price.shape[2])
         guessed = warm and attempt == 0 and guess(program, maps, table, u, work, guess_z, guess_y, guess_at)
         if guessed:
             resume(program, work, room.base)
-        status = solve_rows(maps, program, work, room, starts, at, limit)
+        status = solve_rows(maps, program, work, room, lanes, limit)
         if softest:
             for _ in range(PROXIMAL_STEPS):
                 if status != OPTIMAL or not again(program, maps, table, u, work, room):
                     break
-                status = solve_rows(maps, program, work, room, starts, at, limit)
+                status = solve_rows(maps, program, work, room, lanes, limit)
         if status == OPTIMAL:
-            if attempt == 1:
-                clear_multipliers(program, y, at)
-            if certify(maps, program, table, u, work, room, starts, at, z, y) <= EXACT:
+            clear_multipliers(program, y, at)
+            stationarity(maps, lanes)
+            if certify(program, table, u, work, room, lanes, 0, at, z, y) <= EXACT:
                 return OPTIMAL
             status = ROUGH
         if not guessed or status == LIMIT:
@@ -423,21 +402,90 @@ def solve_one(
 
 
 @compiled_bare
+def begin(
+    maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room, lanes: Lanes,
+    warm: bool, guess_z: Array, guess_y: Array, guess_at: int, limit: int,
+) -> int:  # fmt: skip
+    """Active set of a program by the kernel's signals; return how it ended, or that it wants more care."""
+    work.counter[STEPS] = 0
+    if proximal(program, maps, table, u, work, room):
+        return ALONE
+    read_signals(maps, lanes, u, room.base)
+    reset(work, table.price.shape[2])
+    guessed = warm and guess(program, maps, table, u, work, guess_z, guess_y, guess_at)
+    if guessed:
+        resume(program, work, room.base)
+    status = ascend(program, maps, work, room.base, room.signals, room.plane, limit)
+    return ALONE if guessed and status == INFEASIBLE else status
+
+
+@compiled_bare
+def keep(work: WorkingSet, kept: Kept, u: int) -> None:
+    """Note a program's working set."""
+    kept.count[u], kept.steps[u] = work.counter[WORKING], work.counter[STEPS]
+    for j in range(work.counter[WORKING]):
+        kept.row[u, j], kept.side[u, j], kept.mult[u, j] = work.row[j], work.side[j], work.mult[j]
+    for g in range(kept.slack.shape[1]):
+        kept.slack[u, g], kept.total[u, g] = work.slack[g], work.total[g]
+    for g in range(kept.slack.shape[1]):
+        kept.is_open[u, g] = work.is_open[g]
+
+
+@compiled_bare
+def recall(work: WorkingSet, kept: Kept, u: int) -> None:
+    """Take up a program's working set again, as far as its certificate needs it."""
+    work.counter[WORKING], work.counter[STEPS] = kept.count[u], kept.steps[u]
+    for j in range(kept.count[u]):
+        work.row[j], work.side[j], work.mult[j] = kept.row[u, j], kept.side[u, j], kept.mult[u, j]
+    for g in range(kept.slack.shape[1]):
+        work.slack[g], work.total[g] = kept.slack[u, g], kept.total[u, g]
+    for g in range(kept.slack.shape[1]):
+        work.is_open[g] = kept.is_open[u, g]
+
+
+@compiled_bare
 def solve_all(
     maps: SignalMaps, places: RowPlaces, table: RowTable, programs: Index, work: WorkingSet, room: Room,
-    initial: Array, reference: Array, warm: bool, guess_z: Array, guess_y: Array, limit: int,
-    z: Array, y: Array, residuals: Array, ends: NDArray[np.int64], steps: Index,
+    kept: Kept, lanes: Lanes, single: Lanes, initial: Array, reference: Array, warm: bool,
+    guess_z: Array, guess_y: Array, limit: int, z: Array, y: Array, residuals: Array,
+    ends: NDArray[np.int64], steps: Index,
 ) -> None:  # fmt: skip
-    """Solve the programs one after the other; see :func:`solve_programs`."""
+    """Solve programs side by side, then those alone that want it; see :func:`solve_programs`."""
     for u in range(len(programs)):
-        i = programs[u]
-        g = i if warm else 0
-        ends[i] = solve_one(
-            maps, places, table, u, work, room, initial, reference, i, warm, guess_z, guess_y, g, limit, z, y
-        )
-        if ends[i] != UNUSABLE:
-            steps[i] = work.counter[STEPS]
-        if ends[i] == OPTIMAL or ends[i] == ROUGH:
+        take(maps, lanes, u, initial, reference, programs[u])
+    sweep(maps, lanes, False)
+    clear(lanes.loads)
+    for u in range(len(programs)):
+        if table.sound[u] == 0 or lanes.lost[u] > 0:
+            kept.end[u] = UNUSABLE
+            continue
+        program = Program(table.number, table.plane, places, u)
+        g = programs[u] if warm else 0
+        kept.end[u] = begin(maps, program, table, u, work, room, lanes, warm, guess_z, guess_y, g, limit)
+        keep(work, kept, u)
+        if kept.end[u] == OPTIMAL:
+            load(maps, program, work, lanes, u)
+    sweep(maps, lanes, True)
+    stationarity(maps, lanes)
+    for u in range(len(programs)):
+        i, end = programs[u], kept.end[u]
+        program = Program(table.number, table.plane, places, u)
+        if end == OPTIMAL:
+            recall(work, kept, u)
+            read_signals(maps, lanes, u, room.exact)
+            if not certify(program, table, u, work, room, lanes, u, i, z, y) <= PLAIN:
+                end = ALONE
+        if end == ALONE:
+            take(maps, single, 0, initial, reference, i)
+            g = i if warm else 0
+            end = solve_alone(
+                maps, program, table, u, work, room, single, i, warm, guess_z, guess_y, g, limit, z, y
+            )
+            kept.steps[u] = work.counter[STEPS]
+        ends[i] = end
+        if end != UNUSABLE:
+            steps[i] = kept.steps[u]
+        if end == OPTIMAL or end == ROUGH:
             for e in range(3):
                 residuals[i, e] = room.certificate[2 * e]
         else:
@@ -484,8 +532,12 @@ def solve_programs(
     """
     stages, shelves = table.plane.shape[3], table.shelves.shape[2]
     work = working_set(column, gram, factor, table.plane.shape[2], shelves + 1, stages)
-    room = make_room(stages, shelves * stages, len(gram))
+    room, kept = (
+        make_room(stages, shelves * stages, len(gram)),
+        make_kept(len(programs), shelves * stages, len(gram)),
+    )
+    lanes, single = make_lanes(stages, len(programs)), make_lanes(stages, 1)
     solve_all(
-        maps, places, table, programs, work, room, initial, reference, warm, guess_z, guess_y, limit,
-        z, y, residuals, ends, steps,
+        maps, places, table, programs, work, room, kept, lanes, single, initial, reference, warm,
+        guess_z, guess_y, limit, z, y, residuals, ends, steps,
     )  # fmt: skip

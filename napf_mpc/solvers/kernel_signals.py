@@ -17,7 +17,6 @@ from scipy.linalg import solve_triangular
 from scipy.sparse.csgraph import connected_components
 
 from napf_mpc.constraints.constraint import SIGNALS
-from napf_mpc.jit import compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, Index, QpError
 
 KINDS = tuple(SIGNALS)
@@ -30,10 +29,6 @@ FIRST = np.cumsum([0, *(len(SIGNALS[kind]) for kind in KINDS)])[:-1]
 """(4,) number of the first signal of each kind."""
 A, B, Q, R, CLOSED, GAIN, PULL, INVERSE, TO_GO = range(9)
 """Matrices of a stage: the model's; A - B K, K, H^-1 B' and H^-1; the optimal cost from its end on."""
-A_TURNED, B_TURNED, CLOSED_TURNED, GAIN_TURNED = range(9, 13)
-"""Transposes."""
-QUAD = 4
-"""Entries of a row come in fours, filled up with zeros: sums of four do not wait for each other."""
 NOISE = 1e-14
 """Entries of a weight below this part of what its diagonal allows are rounding."""
 LOOSE = 1e-13
@@ -49,10 +44,10 @@ Small = NDArray[np.uint32]
 class SignalMaps(NamedTuple):
     """A model as the compiled loops need it: matrices as lists of their entries, and the signal kernel."""
 
-    rows: Index
-    """(13,) rows of each matrix, see :data:`A` to :data:`GAIN_TURNED`."""
     begins: Index
-    """(13, N, 13) where the entries of each matrix, stage and row begin, and where those of the last end."""
+    """(9, N + 1) where the entries of each matrix and stage begin, see :data:`A` to :data:`TO_GO`."""
+    row: Small
+    """(entries,)."""
     column: Small
     """(entries,)."""
     value: Array
@@ -108,8 +103,7 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
     at = (order[:, None] * n + np.arange(n)).ravel()
     chain_of = np.repeat(chain[order], n)
     pull = inverse @ model.b.transpose(t)
-    turned = [m.transpose(t) for m in (model.a, model.b, closed, gain)]
-    matrices = (model.a, model.b, model.q, model.r, closed, gain, pull, inverse, to_go, *turned)
+    matrices = (model.a, model.b, model.q, model.r, closed, gain, pull, inverse, to_go)
     return SignalMaps(
         *_entries(matrices),
         np.ascontiguousarray(kernel[np.ix_(at, at)]),
@@ -128,29 +122,20 @@ def _cleaned(weight: Array) -> Array:
     return np.where(np.abs(weight) <= NOISE * size[:, None] * size, 0.0, weight)
 
 
-def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Index, Small, Array]:
-    """Rows of each matrix; where each matrix, stage and row begins; entries that are not zero, and padding."""
+def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Small, Small, Array]:
+    """Where each matrix and stage begins; row, column and value of all entries that are not zero."""
     stages = len(matrices[0])
-    begins = np.empty((len(matrices), stages, STATES + 1), dtype=np.int64)
-    columns, values, count = [], [], 0
+    begins = np.empty((len(matrices), stages + 1), dtype=np.int64)
+    rows, columns, values, count = [], [], [], 0
     for which, matrix in enumerate(matrices):
-        some = matrix != 0.0
-        # A matrix of fewer rows has empty ones behind its own.
-        wide = np.zeros((stages, STATES), dtype=np.int64)
-        wide[:, : matrix.shape[1]] = -(-some.sum(axis=2) // QUAD) * QUAD
-        ends = count + wide.cumsum().reshape(stages, STATES)
-        begins[which, :, 1:], begins[which, :, 0] = ends, ends[:, 0] - wide[:, 0]
-        size = int(wide.sum())
-        column, value = np.zeros(size, dtype=np.uint32), np.zeros(size)
-        stage, row, at = np.nonzero(some)
-        mine = begins[which, stage, row]
-        place = mine - count + np.arange(len(mine)) - np.searchsorted(mine, mine)
-        column[place], value[place] = at, matrix[stage, row, at]
+        stage, row, column = np.nonzero(matrix)
+        begins[which] = count + np.searchsorted(stage, np.arange(stages + 1))
+        rows.append(row)
         columns.append(column)
-        values.append(value)
-        count += size
-    rows = np.array([matrix.shape[1] for matrix in matrices], dtype=np.int64)
-    return rows, begins, np.concatenate(columns), np.concatenate(values)
+        values.append(matrix[stage, row, column])
+        count += len(stage)
+    places = [np.concatenate(v).astype(np.uint32) for v in (rows, columns)]
+    return begins, places[0], places[1], np.concatenate(values)
 
 
 def _inverse_root(hessian: Array, stage: int) -> Array:
@@ -197,161 +182,3 @@ def _chains(kernel: Array, stages: int) -> tuple[Index, Index]:
     linked = np.asarray(near.reshape(count, stages, count, stages).any(axis=(1, 3)), dtype=float)
     _, chain = connected_components(linked, directed=False)
     return np.argsort(chain, kind="stable"), chain.astype(np.int64)
-
-
-@compiled_bare
-def add(
-    maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
-) -> None:
-    """Add ``sign matrix vector[at]`` of a matrix of stage k to ``out[to, first:]``.
-
-    Arrays come whole with indices: views of them are counted, which costs more than the sums.
-    """
-    for r in range(maps.rows[which]):
-        total = 0.0
-        for e in range(max(maps.begins[which, k, r], 0), maps.begins[which, k, r + 1], QUAD):
-            one = maps.value[e] * vector[at, maps.column[e]]
-            two = maps.value[e + 1] * vector[at, maps.column[e + 1]]
-            three = maps.value[e + 2] * vector[at, maps.column[e + 2]]
-            four = maps.value[e + 3] * vector[at, maps.column[e + 3]]
-            total += (one + two) + (three + four)
-        out[to, first + r] += sign * total
-
-
-@compiled_bare
-def sweep(
-    maps: SignalMaps, starts: Array, at: int, pull: Array, push: Array, pushed: bool,
-    feed: Array, cost: Array, states: Array, inputs: Array,
-) -> None:  # fmt: skip
-    """Optimal states and inputs for a linear cost ``pull . x + push . u`` beside the model's own.
-
-    Parameters
-    ----------
-    maps : SignalMaps
-        Model.
-    starts : array, shape (batch, 12)
-        States now.
-    at : int
-        Which of them.
-    pull, push : array, shapes (N, 12) and (N, 4)
-        Linear cost of the state at the end of each stage and of its input.
-    pushed : bool
-        Whether push is anything but zero.
-    feed : array, shape (N, 4)
-        Room to work in.
-    cost : array, shape (N, 12)
-        Where the linear part of the optimal cost from the end of each stage on goes.
-    states, inputs : array, shapes (N, 12) and (N, 4)
-        Where the answer goes.
-    """
-    n = len(feed)
-    for k in range(n):
-        for i in range(STATES):
-            cost[k, i], states[k, i] = pull[k, i], 0.0
-        for m in range(INPUTS):
-            feed[k, m], inputs[k, m] = 0.0, 0.0
-    for k in range(n - 1, -1, -1):
-        add(maps, PULL, k, -1.0, cost, k, feed, k, 0)
-        if pushed:
-            add(maps, INVERSE, k, -1.0, push, k, feed, k, 0)
-        if k == 0:
-            break
-        add(maps, CLOSED_TURNED, k, 1.0, cost, k, cost, k - 1, 0)
-        if pushed:
-            add(maps, GAIN_TURNED, k, -1.0, push, k, cost, k - 1, 0)
-    for k in range(n):
-        for m in range(INPUTS):
-            inputs[k, m] = feed[k, m]
-        if k == 0:
-            add(maps, GAIN, k, -1.0, starts, at, inputs, k, 0)
-            add(maps, A, k, 1.0, starts, at, states, k, 0)
-        else:
-            add(maps, GAIN, k, -1.0, states, k - 1, inputs, k, 0)
-            add(maps, A, k, 1.0, states, k - 1, states, k, 0)
-        add(maps, B, k, 1.0, inputs, k, states, k, 0)
-
-
-@compiled_bare
-def read_signals(maps: SignalMaps, states: Array, inputs: Array, signals: Array) -> None:
-    """Write the signals (13 N,) of states (N, 12) and inputs (N, 4)."""
-    for i in range(len(signals)):
-        k, target = maps.stage[i], maps.target[i]
-        signals[i] = states[k, target] if target < STATES else inputs[k, target - STATES]
-
-
-@compiled_bare
-def stationarity(
-    maps: SignalMaps, starts: Array, at: int, states: Array, inputs: Array, cost: Array, linear: Array,
-    force: Array, costates: Array, loads: Array, weighed: Array, carried: Array, out: Array,
-) -> None:  # fmt: skip
-    """Multipliers of the dynamics, and how well states and inputs balance model, cost and forces.
-
-    The multipliers are minus the gradient of the optimal cost from each stage on; the balance is taken of the
-    model's own matrices.
-
-    Parameters
-    ----------
-    maps : SignalMaps
-        Model.
-    starts : array, shape (batch, 12)
-        States now.
-    at : int
-        Which of them.
-    states, inputs : array, shapes (N, 12) and (N, 4)
-        The plan.
-    cost : array, shape (N, 12)
-        From the sweep that made the plan.
-    linear : array, shape (N, 12)
-        -Q ref.
-    force : array, shape (13 N,)
-        Sum of the rows times their multipliers, by signal.
-    costates : array, shape (N, 12)
-        Where the multipliers of the dynamics go.
-    loads, weighed, carried : array, shape (N, 16)
-        Room to work in.
-    out : array, shape (6,)
-        Largest violation of the dynamics and its largest term, largest entry of the Lagrangian's gradient and
-        its largest term, largest multiplier times violation of the dynamics and its largest term.
-    """
-    n = len(states)
-    for k in range(n):
-        for i in range(STATES + INPUTS):
-            loads[k, i], weighed[k, i], carried[k, i] = 0.0, 0.0, 0.0
-        for i in range(STATES):
-            costates[k, i] = -cost[k, i]
-    for i in range(len(force)):
-        loads[maps.stage[i], maps.target[i]] += force[i]
-    gradient, largest = 0.0, 0.0
-    for k in range(n - 1, -1, -1):
-        add(maps, TO_GO, k, -1.0, states, k, costates, k, 0)
-        add(maps, Q, k, 1.0, states, k, weighed, k, 0)
-        if k + 1 < n:
-            add(maps, A_TURNED, k + 1, 1.0, costates, k + 1, carried, k, 0)
-        add(maps, R, k, 1.0, inputs, k, weighed, k, STATES)
-        add(maps, B_TURNED, k, 1.0, costates, k, carried, k, STATES)
-    for k in range(n):
-        for i in range(STATES):
-            left = weighed[k, i] + linear[k, i] + costates[k, i] - carried[k, i] - loads[k, i]
-            gradient = max(gradient, abs(left))
-            largest = max(largest, max(abs(weighed[k, i]), max(abs(linear[k, i]), abs(costates[k, i]))))
-        for m in range(STATES, STATES + INPUTS):
-            gradient = max(gradient, abs(weighed[k, m] - carried[k, m] - loads[k, m]))
-            largest = max(largest, max(abs(weighed[k, m]), abs(loads[k, m])))
-    out[2], out[3] = gradient, largest
-    off, size, product, most = 0.0, 0.0, 0.0, 0.0
-    for k in range(n):
-        # The other way round than in the sweep, and in place of what is no longer needed.
-        for i in range(STATES):
-            loads[k, i] = 0.0
-        add(maps, B, k, 1.0, inputs, k, loads, k, 0)
-        if k == 0:
-            add(maps, A, k, 1.0, starts, at, loads, k, 0)
-        else:
-            add(maps, A, k, 1.0, states, k - 1, loads, k, 0)
-    for k in range(n):
-        for i in range(STATES):
-            gap = abs(states[k, i] - loads[k, i])
-            off, size = max(off, gap), max(size, abs(states[k, i]))
-            product = max(product, gap * abs(costates[k, i]))
-            most = max(most, abs(costates[k, i] * states[k, i]))
-    out[0], out[1], out[4], out[5] = off, size, product, most
