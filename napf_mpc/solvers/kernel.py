@@ -13,10 +13,11 @@ import numpy as np
 
 from napf_mpc.qp import STATES, Array, HorizonModel, HorizonQp, Index, Layout, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult, Mask, WarmStart, checked_guess, why_unusable
-from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, capacity
-from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, solve_programs
+from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, WorkingSet
+from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, Kept, Room, solve_programs
 from napf_mpc.solvers.kernel_rows import RowPlaces, RowTable, gather
-from napf_mpc.solvers.kernel_signals import TARGETS, SignalMaps, signal_maps
+from napf_mpc.solvers.kernel_signals import SignalMaps, signal_maps
+from napf_mpc.solvers.kernel_sweep import Lanes
 
 CHUNK = 32
 """Programs whose rows are gathered together: few enough to stay in the cache."""
@@ -45,9 +46,11 @@ class _Home:
     first: tuple[tuple[int, int], ...]
     """First family and first row of slacks of each block."""
     table: RowTable
-    column: Array
-    gram: Array
-    factor: Array
+    work: WorkingSet
+    room: Room
+    kept: Kept
+    lanes: dict[int, Lanes]
+    """By their number."""
 
     @classmethod
     def of(cls, horizon: HorizonQp, maps: SignalMaps | None) -> _Home:
@@ -59,12 +62,19 @@ class _Home:
         for _, count, per_stage, _, _ in layout.kinds:
             first.append((families, shelves))
             families, shelves = families + count, shelves + per_stage
-        size = capacity(n, families * n, shelves * n)
+        soft = shelves * n
+        work = WorkingSet.empty(families, shelves + 1, n, soft)
         return cls(
             horizon.model, layout, maps, RowPlaces.of(layout, maps.place), tuple(first),
-            RowTable.empty(CHUNK, families, shelves, n),
-            np.empty((size, len(TARGETS) * n)), np.empty((size, size)), np.empty((size, size)),
+            RowTable.empty(CHUNK, families, shelves, n), work, Room.empty(n, soft, len(work.row)),
+            Kept.empty(CHUNK, soft, len(work.row)), {1: Lanes.empty(n, 1)},
         )  # fmt: skip
+
+    def lanes_for(self, count: int) -> Lanes:
+        """Room for so many programs side by side."""
+        if count not in self.lanes:
+            self.lanes[count] = Lanes.empty(self.layout.stages, count)
+        return self.lanes[count]
 
 
 class KernelSolver:
@@ -143,7 +153,8 @@ class KernelSolver:
             for (family, shelf), arrays in zip(home.first, blocks, strict=True):
                 gather(home.table, programs, family, shelf, step_s, *arrays)
             solve_programs(
-                home.maps, home.places, home.table, programs, home.column, home.gram, home.factor, initial, reference,
+                home.maps, home.places, home.table, programs, home.work, home.room, home.kept,
+                home.lanes_for(len(programs)), home.lanes[1], initial, reference,
                 guesses is not None, *guess, self._limit, z, y, residuals, ends, steps,
             )  # fmt: skip
         return _result(horizon, layout, z, y, residuals, ends, steps)

@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled, compiled_bare
-from napf_mpc.qp import Array, Index
+from napf_mpc.jit import compiled_bare
+from napf_mpc.qp import STATES, Array, Index
 from napf_mpc.solvers.kernel_rows import HIGH, LOW, WIDTH, RowPlaces
 from napf_mpc.solvers.kernel_signals import SignalMaps
 
@@ -101,26 +101,26 @@ class WorkingSet(NamedTuple):
     value: Array
     """(family, N) values of the rows then."""
 
+    @classmethod
+    def empty(cls, families: int, shelves: int, stages: int, soft: int) -> WorkingSet:
+        """Room for programs of a size; the last row of shelves is that of hard rows."""
+        rows, groups = families * stages, shelves * stages
+        n = capacity(stages, rows, soft)
+        shelf = np.zeros((shelves, stages))
+        floats, wholes = [np.zeros(n) for _ in range(4)], [np.zeros(n, dtype=np.int64) for _ in range(3)]
+        prices = [np.zeros(groups) for _ in range(4)]
+        return cls(
+            wholes[0], floats[0], wholes[1], *floats[1:],
+            np.zeros((n, (STATES + 1) * stages)), np.zeros((n, n)), np.zeros((n, n)), wholes[2],
+            np.zeros(rows, dtype=np.uint8), np.zeros(groups, dtype=np.bool_), shelf.reshape(groups), shelf,
+            *prices, np.zeros(groups, dtype=np.int64), np.zeros(5, dtype=np.int64),
+            np.zeros(rows, dtype=np.int64), np.zeros((families, stages)), np.zeros((families, stages)),
+        )  # fmt: skip
+
 
 def capacity(stages: int, rows: int, groups: int) -> int:
     """Members at most: each is new to the inputs or to the slack of an open group."""
     return min(2 * rows, 4 * stages + groups) + 2
-
-
-@compiled
-def working_set(
-    column: Array, gram: Array, factor: Array, families: int, shelves: int, stages: int
-) -> WorkingSet:
-    """Room for programs of a size; the large arrays are kept by the caller."""
-    n, rows, groups = len(gram), families * stages, shelves * stages
-    shelf = np.zeros((shelves, stages))
-    return WorkingSet(
-        np.empty(n, np.int64), np.empty(n), np.empty(n, np.int64), np.empty(n), np.empty(n), np.empty(n),
-        column, gram, factor, np.empty(n, np.int64), np.empty(rows, np.uint8),
-        np.empty(groups, np.bool_), shelf.reshape(groups), shelf, np.empty(groups), np.empty(groups),
-        np.empty(groups), np.empty(groups), np.empty(groups, np.int64), np.zeros(5, np.int64),
-        np.empty(rows, np.int64), np.empty((families, stages)), np.empty((families, stages)),
-    )  # fmt: skip
 
 
 @compiled_bare

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled, compiled_bare
+from napf_mpc.jit import compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
 from napf_mpc.solvers.kernel_active_set import (
     INFEASIBLE,
@@ -27,14 +27,12 @@ from napf_mpc.solvers.kernel_active_set import (
     resume,
     row_value,
     sums,
-    working_set,
 )
 from napf_mpc.solvers.kernel_rows import HIGH, LOW, W1, W2, WIDTH, RowPlaces, RowTable
 from napf_mpc.solvers.kernel_signals import SignalMaps
 from napf_mpc.solvers.kernel_sweep import (
     Lanes,
     clear,
-    make_lanes,
     read_signals,
     stationarity,
     sweep,
@@ -88,6 +86,17 @@ class Room(NamedTuple):
     side: Array
     """(capacity,) their sides."""
 
+    @classmethod
+    def empty(cls, stages: int, soft: int, members: int) -> Room:
+        """Room for programs of a size."""
+        shape = (STATES + 1, stages)
+        plane, exact = np.zeros(shape), np.zeros(shape)
+        return cls(
+            np.zeros(plane.size), plane.reshape(-1), plane, exact.reshape(-1), exact, np.zeros(6),
+            np.zeros(soft), np.zeros(soft), np.zeros(soft, dtype=np.bool_),
+            np.zeros(members, dtype=np.int64), np.zeros(members),
+        )  # fmt: skip
+
 
 class Kept(NamedTuple):
     """Working sets of some programs while their plans are made side by side."""
@@ -111,28 +120,15 @@ class Kept(NamedTuple):
     is_open: NDArray[np.bool_]
     """(program, soft group)."""
 
-
-@compiled
-def make_room(stages: int, soft: int, capacity: int) -> Room:
-    """Room for programs of a size."""
-    signals = (STATES + 1) * stages
-    plane, exact = np.zeros((STATES + 1, stages)), np.zeros((STATES + 1, stages))
-    return Room(
-        np.zeros(signals), plane.reshape(signals), plane, exact.reshape(signals), exact,
-        np.zeros(6), np.zeros(soft), np.zeros(soft), np.zeros(soft, np.bool_),
-        np.zeros(capacity, np.int64), np.zeros(capacity),
-    )  # fmt: skip
-
-
-@compiled
-def make_kept(programs: int, soft: int, capacity: int) -> Kept:
-    """Room for so many programs."""
-    return Kept(
-        np.zeros(programs, np.int64), np.zeros(programs, np.int64), np.zeros(programs, np.int64),
-        np.empty((programs, capacity), np.int64), np.empty((programs, capacity)),
-        np.empty((programs, capacity)), np.empty((programs, soft)), np.empty((programs, soft)),
-        np.empty((programs, soft), np.bool_),
-    )  # fmt: skip
+    @classmethod
+    def empty(cls, programs: int, soft: int, members: int) -> Kept:
+        """Room for so many programs."""
+        wholes = [np.zeros(programs, dtype=np.int64) for _ in range(3)]
+        return cls(
+            *wholes, np.zeros((programs, members), dtype=np.int64), np.zeros((programs, members)),
+            np.zeros((programs, members)), np.zeros((programs, soft)), np.zeros((programs, soft)),
+            np.zeros((programs, soft), dtype=np.bool_),
+        )  # fmt: skip
 
 
 @compiled_bare
@@ -444,13 +440,41 @@ def recall(work: WorkingSet, kept: Kept, u: int) -> None:
 
 
 @compiled_bare
-def solve_all(
+def solve_programs(
     maps: SignalMaps, places: RowPlaces, table: RowTable, programs: Index, work: WorkingSet, room: Room,
     kept: Kept, lanes: Lanes, single: Lanes, initial: Array, reference: Array, warm: bool,
     guess_z: Array, guess_y: Array, limit: int, z: Array, y: Array, residuals: Array,
     ends: NDArray[np.int64], steps: Index,
 ) -> None:  # fmt: skip
-    """Solve programs side by side, then those alone that want it; see :func:`solve_programs`."""
+    """Solve all programs of a table: side by side, then those alone that want more care.
+
+    Parameters
+    ----------
+    maps : SignalMaps
+        Model.
+    places : RowPlaces
+        Where their rows stand.
+    table : RowTable
+        Rows of the programs.
+    programs : array of int, shape (programs of the table,)
+        Their places in the batch.
+    work, room, kept, lanes, single : WorkingSet, Room, Kept and two Lanes
+        Room to work in; lanes are as many as programs, and a single one.
+    initial, reference : array, shapes (batch, 12) and (batch, N, 12)
+        As in :class:`~napf_mpc.qp.HorizonQp`.
+    warm : bool
+        Whether there are guesses.
+    guess_z, guess_y : array, shapes (batch, n) and (batch, m)
+        Guesses.
+    limit : int
+        Steps of a program at most.
+    z, y : array, shapes (batch, n) and (batch, m)
+        Where answers go.
+    residuals : array, shape (batch, 3)
+        Primal, dual, complementarity.
+    ends, steps : array of int, shape (batch,)
+        How each program ended, and after how many steps.
+    """
     for u in range(len(programs)):
         take(maps, lanes, u, initial, reference, programs[u])
     sweep(maps, lanes, False)
@@ -485,7 +509,7 @@ def solve_all(
         ends[i] = end
         if end != UNUSABLE:
             steps[i] = kept.steps[u]
-        if end == OPTIMAL or end == ROUGH:
+        if end in (OPTIMAL, ROUGH):
             for e in range(3):
                 residuals[i, e] = room.certificate[2 * e]
         else:
@@ -493,51 +517,3 @@ def solve_all(
                 z[i, e] = np.nan
             for e in range(y.shape[1]):
                 y[i, e] = np.nan
-
-
-@compiled
-def solve_programs(
-    maps: SignalMaps, places: RowPlaces, table: RowTable, programs: Index, column: Array, gram: Array, factor: Array,
-    initial: Array, reference: Array, warm: bool, guess_z: Array, guess_y: Array, limit: int,
-    z: Array, y: Array, residuals: Array, ends: NDArray[np.int64], steps: Index,
-) -> None:  # fmt: skip
-    """Solve all programs of a table, each by itself.
-
-    Parameters
-    ----------
-    maps : SignalMaps
-        Model.
-    places : RowPlaces
-        Where their rows stand.
-    table : RowTable
-        Rows of the programs.
-    programs : array of int, shape (programs of the table,)
-        Their places in the batch.
-    column, gram, factor : array, shapes (capacity, 13 N) and (capacity, capacity)
-        Room to work in.
-    initial, reference : array, shapes (batch, 12) and (batch, N, 12)
-        As in :class:`~napf_mpc.qp.HorizonQp`.
-    warm : bool
-        Whether there are guesses.
-    guess_z, guess_y : array, shapes (batch, n) and (batch, m)
-        Guesses.
-    limit : int
-        Steps of a program at most.
-    z, y : array, shapes (batch, n) and (batch, m)
-        Where answers go.
-    residuals : array, shape (batch, 3)
-        Primal, dual, complementarity.
-    ends, steps : array of int, shape (batch,)
-        How each program ended, and after how many steps.
-    """
-    stages, shelves = table.plane.shape[3], table.shelves.shape[2]
-    work = working_set(column, gram, factor, table.plane.shape[2], shelves + 1, stages)
-    room, kept = (
-        make_room(stages, shelves * stages, len(gram)),
-        make_kept(len(programs), shelves * stages, len(gram)),
-    )
-    lanes, single = make_lanes(stages, len(programs)), make_lanes(stages, 1)
-    solve_all(
-        maps, places, table, programs, work, room, kept, lanes, single, initial, reference, warm,
-        guess_z, guess_y, limit, z, y, residuals, ends, steps,
-    )  # fmt: skip

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from napf_mpc.jit import compiled, compiled_bare
+from napf_mpc.jit import compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
-from napf_mpc.solvers.kernel_signals import A, B, CLOSED, GAIN, INVERSE, PULL, Q, R, TO_GO, SignalMaps
+from napf_mpc.solvers.kernel_signals import CLOSED, GAIN, INVERSE, PULL, TO_GO, A, B, Q, R, SignalMaps
 
 
 class Lanes(NamedTuple):
@@ -48,19 +48,16 @@ class Lanes(NamedTuple):
     balance: Array
     """(6, lane) residual and largest term of dynamics, gradient and complementarity."""
 
-
-@compiled
-def make_lanes(stages: int, count: int) -> Lanes:
-    """Room for so many programs."""
-    both = STATES + INPUTS
-    return Lanes(
-        np.zeros((1, STATES, count)), np.zeros((stages, STATES, count)), np.zeros((stages, STATES, count)),
-        np.zeros((stages, both, count)), np.zeros((stages, INPUTS, count)), np.zeros((stages, INPUTS, count)),
-        np.zeros((stages, STATES, count)), np.zeros((stages, STATES, count)),
-        np.zeros((stages, INPUTS, count)), np.zeros((stages, STATES, count)),
-        np.zeros((stages, both, count)), np.zeros((stages, both, count)),
-        np.zeros(count, np.int64), np.zeros((6, count)),
-    )  # fmt: skip
+    @classmethod
+    def empty(cls, stages: int, count: int) -> Lanes:
+        """Room for so many programs."""
+        sizes = {
+            "start": (1, STATES), "loads": (stages, STATES + INPUTS), "feed": (stages, INPUTS),
+            "push": (stages, INPUTS), "inputs": (stages, INPUTS), "weighed": (stages, STATES + INPUTS),
+            "carried": (stages, STATES + INPUTS),
+        }  # fmt: skip
+        large = [np.zeros((*sizes.get(name, (stages, STATES)), count)) for name in cls._fields[:-2]]
+        return cls(*large, np.zeros(count, dtype=np.int64), np.zeros((6, count)))
 
 
 @compiled_bare
@@ -108,7 +105,7 @@ def take(maps: SignalMaps, lanes: Lanes, lane: int, starts: Array, references: A
 
 @compiled_bare
 def sweep(maps: SignalMaps, lanes: Lanes, loaded: bool) -> None:
-    """Optimal states and inputs under the loads, if there are any, for the model's cost and the references."""
+    """Optimal states and inputs for the model's cost and the references, under the loads if there are any."""
     n = lanes.linear.shape[0]
     if not loaded:
         clear(lanes.linear)
