@@ -17,3 +17,12 @@ def compiled(function: F) -> F:
     that the function means the same whether it is compiled or not (``function.py_func`` is the plain one).
     """
     return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+def compiled_bare(function: F) -> F:
+    """The same without reference counts, for what allocates nothing and is called from compiled code alone.
+
+    A count for every array of every call costs more than the few sums of a small function. What such a
+    function calls must be compiled so as well.
+    """
+    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function))

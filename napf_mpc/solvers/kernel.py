@@ -13,12 +13,13 @@ import numpy as np
 
 from napf_mpc.qp import STATES, Array, HorizonModel, HorizonQp, Index, Layout, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult, Mask, WarmStart, checked_guess, why_unusable
-from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, capacity
-from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, solve_programs
-from napf_mpc.solvers.kernel_rows import WIDTH, Block, RowTable, gather
-from napf_mpc.solvers.kernel_signals import FIRST, KINDS, TARGETS, SignalMaps, signal_maps
+from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, WorkingSet
+from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, Kept, Room, solve_programs
+from napf_mpc.solvers.kernel_rows import RowPlaces, RowTable, gather
+from napf_mpc.solvers.kernel_signals import SignalMaps, signal_maps
+from napf_mpc.solvers.kernel_sweep import Lanes
 
-CHUNK = 16
+CHUNK = 32
 """Programs whose rows are gathered together: few enough to stay in the cache."""
 _STATUS = {
     OPTIMAL: QpStatus.SOLVED,
@@ -41,14 +42,15 @@ class _Home:
     model: HorizonModel
     layout: Layout
     maps: SignalMaps
-    signals: Index
-    """(block, 4) places in the signals of each block's axes at the first stage."""
-    starts: Index
-    """(block, 4) where each block's slacks, lower, upper and slack multipliers start."""
+    places: RowPlaces
+    first: tuple[tuple[int, int], ...]
+    """First family and first row of slacks of each block."""
     table: RowTable
-    column: Array
-    gram: Array
-    factor: Array
+    work: WorkingSet
+    room: Room
+    kept: Kept
+    lanes: dict[int, Lanes]
+    """By their number."""
 
     @classmethod
     def of(cls, horizon: HorizonQp, maps: SignalMaps | None) -> _Home:
@@ -56,23 +58,23 @@ class _Home:
         maps = signal_maps(horizon.model) if maps is None else maps
         layout = Layout.of(horizon)
         n = layout.stages
-        signals, starts, row, rows, groups = [], [], STATES * n, 0, 0
-        for (signal, count, per_stage, low, high), slack in zip(layout.kinds, layout.slacks, strict=True):
-            first = int(FIRST[KINDS.index(signal)])
-            signals.append(n * maps.place[np.minimum(first + np.arange(WIDTH), len(TARGETS) - 1)])
-            copies = low + high if per_stage else 1
-            upper = row + count * n if copies == 2 else row
-            starts.append((slack.start, row, upper, row + copies * count * n))
-            row += (copies * count + per_stage) * n
-            rows, groups = rows + count * n, groups + per_stage * n
-        size = capacity(n, rows, groups)
+        first, families, shelves = [], 0, 0
+        for _, count, per_stage, _, _ in layout.kinds:
+            first.append((families, shelves))
+            families, shelves = families + count, shelves + per_stage
+        soft = shelves * n
+        work = WorkingSet.empty(families, shelves + 1, n, soft)
         return cls(
-            horizon.model, layout, maps,
-            np.array(signals, dtype=np.int64).reshape(-1, WIDTH),
-            np.array(starts, dtype=np.int64).reshape(-1, 4),
-            RowTable.empty(CHUNK, rows, groups),
-            np.empty((size, len(TARGETS) * n)), np.empty((size, size)), np.empty((size, size)),
+            horizon.model, layout, maps, RowPlaces.of(layout, maps.place), tuple(first),
+            RowTable.empty(CHUNK, families, shelves, n), work, Room.empty(n, soft, len(work.row)),
+            Kept.empty(CHUNK, soft, len(work.row)), {1: Lanes.empty(n, 1)},
         )  # fmt: skip
+
+    def lanes_for(self, count: int) -> Lanes:
+        """Room for so many programs side by side."""
+        if count not in self.lanes:
+            self.lanes[count] = Lanes.empty(self.layout.stages, count)
+        return self.lanes[count]
 
 
 class KernelSolver:
@@ -147,12 +149,12 @@ class KernelSolver:
         todo = np.arange(batch) if asked is None else np.flatnonzero(np.repeat(asked, uavs))
         for first in range(0, len(todo), CHUNK):
             programs = todo[first : first + CHUNK]
-            if blocks:
-                gather(home.table, programs, home.signals, home.starts, step_s, blocks, y)
-            else:
-                home.table.size[:] = (0, 0, 1)
+            home.table.sound[:] = 1
+            for (family, shelf), arrays in zip(home.first, blocks, strict=True):
+                gather(home.table, programs, family, shelf, step_s, *arrays)
             solve_programs(
-                home.maps, home.table, programs, home.column, home.gram, home.factor, initial, reference,
+                home.maps, home.places, home.table, programs, home.work, home.room, home.kept,
+                home.lanes_for(len(programs)), home.lanes[1], initial, reference,
                 guesses is not None, *guess, self._limit, z, y, residuals, ends, steps,
             )  # fmt: skip
         return _result(horizon, layout, z, y, residuals, ends, steps)
@@ -197,10 +199,10 @@ for _end, _status in _STATUS.items():
 _NONE = np.empty((0, 0, 0, 0))
 
 
-def _blocks(horizon: HorizonQp) -> tuple[Block, ...]:
+def _blocks(horizon: HorizonQp) -> tuple[tuple[Array, ...], ...]:
     """Arrays of each block as :func:`~napf_mpc.solvers.kernel_rows.gather` takes them."""
     return tuple(
-        Block(
+        (
             _plain(block.jac),
             _NONE if block.lower is None else _plain(block.lower),
             _NONE if block.upper is None else _plain(block.upper),

@@ -21,10 +21,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
-from napf_mpc.qp import Array, Index
-from napf_mpc.solvers.kernel_rows import GROUP, HIGH, LOW, WIDTH
-from napf_mpc.solvers.kernel_signals import SignalMaps, Small
+from napf_mpc.jit import compiled_bare
+from napf_mpc.qp import STATES, Array, Index
+from napf_mpc.solvers.kernel_rows import HIGH, LOW, WIDTH, RowPlaces
+from napf_mpc.solvers.kernel_signals import SignalMaps
 
 OPTIMAL, INFEASIBLE, LIMIT = 0, 1, 2
 """How the method ends."""
@@ -46,9 +46,9 @@ class Program(NamedTuple):
     """Rows of one program of a :class:`~napf_mpc.solvers.kernel_rows.RowTable`."""
 
     number: Array
-    place: Small
+    plane: Array
+    places: RowPlaces
     u: int
-    rows: int
 
 
 class WorkingSet(NamedTuple):
@@ -74,12 +74,14 @@ class WorkingSet(NamedTuple):
     """(capacity, capacity) transpose of the Cholesky factor, slacks of open groups included."""
     free: Index
     """(capacity,) slots not in use."""
-    member: Index
+    member: NDArray[np.uint8]
     """(rows,) 1 if the row stands at its lower bound, 2 if at its upper, 3 if at both; see SET_ASIDE."""
     is_open: NDArray[np.bool_]
     """(groups,)."""
     slack: Array
     """(groups,)."""
+    shelf: Array
+    """(groups / N, N) the same memory."""
     total: Array
     """(groups,) sum of the multipliers."""
     rate: Array
@@ -94,6 +96,26 @@ class WorkingSet(NamedTuple):
     """(5,) members, opened groups, free slots, steps, suspects."""
     suspect: Index
     """(rows,) rows that were violated when all rows were last looked at."""
+    miss: Array
+    """(family, N) by how much each row was, less than zero if it was met."""
+    value: Array
+    """(family, N) values of the rows then."""
+
+    @classmethod
+    def empty(cls, families: int, shelves: int, stages: int, soft: int) -> WorkingSet:
+        """Room for programs of a size; the last row of shelves is that of hard rows."""
+        rows, groups = families * stages, shelves * stages
+        n = capacity(stages, rows, soft)
+        shelf = np.zeros((shelves, stages))
+        floats, wholes = [np.zeros(n) for _ in range(4)], [np.zeros(n, dtype=np.int64) for _ in range(3)]
+        prices = [np.zeros(groups) for _ in range(4)]
+        return cls(
+            wholes[0], floats[0], wholes[1], *floats[1:],
+            np.zeros((n, (STATES + 1) * stages)), np.zeros((n, n)), np.zeros((n, n)), wholes[2],
+            np.zeros(rows, dtype=np.uint8), np.zeros(groups, dtype=np.bool_), shelf.reshape(groups), shelf,
+            *prices, np.zeros(groups, dtype=np.int64), np.zeros(5, dtype=np.int64),
+            np.zeros(rows, dtype=np.int64), np.zeros((families, stages)), np.zeros((families, stages)),
+        )  # fmt: skip
 
 
 def capacity(stages: int, rows: int, groups: int) -> int:
@@ -101,65 +123,53 @@ def capacity(stages: int, rows: int, groups: int) -> int:
     return min(2 * rows, 4 * stages + groups) + 2
 
 
-@compiled
-def working_set(column: Array, gram: Array, factor: Array, rows: int, groups: int) -> WorkingSet:
-    """Room for programs of a size; the large arrays are kept by the caller."""
-    n = len(gram)
-    return WorkingSet(
-        np.empty(n, np.int64), np.empty(n), np.empty(n, np.int64), np.empty(n), np.empty(n), np.empty(n),
-        column, gram, factor, np.empty(n, np.int64), np.empty(rows, np.int64),
-        np.empty(groups, np.bool_), np.empty(groups), np.empty(groups), np.empty(groups),
-        np.empty(groups), np.empty(groups), np.empty(groups, np.int64), np.zeros(5, np.int64),
-        np.empty(rows, np.int64),
-    )  # fmt: skip
-
-
-@compiled
-def reset(work: WorkingSet, rows: int, groups: int) -> None:
-    """Forget all members; prices w1 and w2 of the groups must be set."""
+@compiled_bare
+def reset(work: WorkingSet, soft: int) -> None:
+    """Forget all members; prices w1 and w2 of the soft groups must be set."""
     for j in range(len(work.free)):
         work.free[j] = j
     work.counter[WORKING], work.counter[OPENED] = 0, 0
     work.counter[FREE] = len(work.free)
-    for r in range(rows):
+    for r in range(len(work.member)):
         work.member[r] = 0
-    for g in range(groups):
+    for g in range(soft):
         work.total[g] = 0.0
         work.is_open[g] = work.w1[g] <= 0.0
         work.slack[g] = -work.w1[g] / work.w2[g] if work.is_open[g] else 0.0
-    hard = len(work.w1) - 1
-    work.w1[hard], work.is_open[hard], work.slack[hard], work.total[hard] = np.inf, False, 0.0, 0.0
+    for g in range(max(soft, 0), len(work.w1)):
+        work.w1[g], work.is_open[g], work.slack[g], work.total[g] = np.inf, False, 0.0, 0.0
 
 
-@compiled
+@compiled_bare
 def row_value(program: Program, row: int, signals: Array) -> float:
     """Value of a row, of signals or of a member's column."""
     total = 0.0
     for d in range(WIDTH):
-        total += program.number[program.u, row, d] * signals[program.place[program.u, row, d]]
+        total += program.number[program.u, d, row] * signals[program.places.signal[d, row]]
     return total
 
 
-@compiled
+@compiled_bare
 def fill_column(program: Program, maps: SignalMaps, row: int, side: float, column: Array) -> None:
     """Write what a unit force along a row does to all signals."""
     for i in range(len(column)):
         column[i] = 0.0
     for d in range(WIDTH):
-        weight = side * program.number[program.u, row, d]
+        weight = side * program.number[program.u, d, row]
         if weight != 0.0:
-            signal = program.place[program.u, row, d]
-            for i in range(maps.begin[signal], maps.end[signal]):
+            signal = program.places.signal[d, row]
+            # The compiler sees that no index is negative.
+            for i in range(max(maps.begin[signal], 0), maps.end[signal]):
                 column[i] += weight * maps.kernel[signal, i]
 
 
-@compiled
+@compiled_bare
 def bond(work: WorkingSet, one: int, other: int) -> float:
     """What two groups' slacks add to the Gram entry of their rows."""
     return 1.0 / work.w2[one] if one == other and work.is_open[one] else 0.0
 
 
-@compiled
+@compiled_bare
 def forward(work: WorkingSet, n: int, values: Array) -> None:
     """Solve with the Cholesky factor, in place."""
     for i in range(n):
@@ -169,17 +179,21 @@ def forward(work: WorkingSet, n: int, values: Array) -> None:
             values[j] -= work.factor[i, j] * known
 
 
-@compiled
+@compiled_bare
 def backward(work: WorkingSet, n: int, values: Array) -> None:
     """Solve with the transpose of the Cholesky factor, in place."""
     for i in range(n - 1, -1, -1):
-        total = values[i]
-        for j in range(i + 1, n):
-            total -= work.factor[i, j] * values[j]
-        values[i] = total / work.factor[i, i]
+        # Two sums need not wait for each other.
+        even, odd = values[i], 0.0
+        for j in range(i + 1, n - 1, 2):
+            even -= work.factor[i, j] * values[j]
+            odd -= work.factor[i, j + 1] * values[j + 1]
+        if (n - i) % 2 == 0:
+            even -= work.factor[i, n - 1] * values[n - 1]
+        values[i] = (even + odd) / work.factor[i, i]
 
 
-@compiled
+@compiled_bare
 def widen(work: WorkingSet, first: int, n: int, extra: Array) -> None:
     """Factor of the Gram matrix plus ``extra extra'``, zero before the first member; spoils extra."""
     for k in range(first, n):
@@ -192,14 +206,14 @@ def widen(work: WorkingSet, first: int, n: int, extra: Array) -> None:
             extra[i] = c * extra[i] - s * work.factor[k, i]
 
 
-@compiled
+@compiled_bare
 def factorise(program: Program, work: WorkingSet, first: int, n: int) -> int:
     """Factor anew from a member on; return the first member that depends on those before, or n."""
     for i in range(first, n):
-        a, mine = work.slot[i], program.place[program.u, work.row[i], GROUP]
+        a, mine = work.slot[i], program.places.group[work.row[i]]
         for j in range(i, n):
             work.factor[i, j] = work.gram[a, work.slot[j]] + bond(
-                work, mine, program.place[program.u, work.row[j], GROUP]
+                work, mine, program.places.group[work.row[j]]
             )
     for k in range(first):
         for i in range(first, n):
@@ -207,7 +221,7 @@ def factorise(program: Program, work: WorkingSet, first: int, n: int) -> int:
             for j in range(i, n):
                 work.factor[i, j] -= known * work.factor[k, j]
     for i in range(first, n):
-        a, mine = work.slot[i], program.place[program.u, work.row[i], GROUP]
+        a, mine = work.slot[i], program.places.group[work.row[i]]
         whole = work.gram[a, a] + bond(work, mine, mine)
         if not work.factor[i, i] > DEPENDENT * whole:
             return i
@@ -221,7 +235,7 @@ def factorise(program: Program, work: WorkingSet, first: int, n: int) -> int:
     return n
 
 
-@compiled
+@compiled_bare
 def enter(program: Program, maps: SignalMaps, work: WorkingSet, row: int, side: float) -> None:
     """Write a row behind the last member, with its column and Gram entries, without making it one."""
     n = work.counter[WORKING]
@@ -236,14 +250,14 @@ def enter(program: Program, maps: SignalMaps, work: WorkingSet, row: int, side: 
         work.gram[work.slot[j], slot] = entry
 
 
-@compiled
+@compiled_bare
 def release(program: Program, work: WorkingSet, j: int, count: int) -> None:
     """Take member j out of a list of so many; the factor is not touched."""
     row, side = work.row[j], work.side[j]
     work.free[work.counter[FREE]] = work.slot[j]
     work.counter[FREE] += 1
     work.member[row] -= 1 if side > 0.0 else 2
-    group = program.place[program.u, row, GROUP]
+    group = program.places.group[row]
     work.total[group] = 0.0
     work.slack[group] = -work.w1[group] / work.w2[group] if work.is_open[group] else 0.0
     for i in range(j, count - 1):
@@ -251,7 +265,7 @@ def release(program: Program, work: WorkingSet, j: int, count: int) -> None:
         work.slot[i], work.mult[i] = work.slot[i + 1], work.mult[i + 1]
 
 
-@compiled
+@compiled_bare
 def drop(program: Program, work: WorkingSet, j: int, waiting: int) -> None:
     """Take member j out of working set and factor; so many rows wait behind the last member."""
     n = work.counter[WORKING]
@@ -268,20 +282,20 @@ def drop(program: Program, work: WorkingSet, j: int, waiting: int) -> None:
     widen(work, j, n - 1, work.part)
 
 
-@compiled
+@compiled_bare
 def open_group(program: Program, work: WorkingSet, group: int) -> None:
     """Let a group's slack go: its row ``s >= 0`` leaves the working set."""
     n = work.counter[WORKING]
     first, root = n, np.sqrt(1.0 / work.w2[group])
     for j in range(n - 1, -1, -1):
-        inside = program.place[program.u, work.row[j], GROUP] == group
+        inside = program.places.group[work.row[j]] == group
         work.part[j] = root if inside else 0.0
         first = j if inside else first
     widen(work, first, n, work.part)
     mark_open(work, group)
 
 
-@compiled
+@compiled_bare
 def mark_open(work: WorkingSet, group: int) -> None:
     """Note that a group is open; the factor is not touched."""
     work.is_open[group] = True
@@ -289,7 +303,17 @@ def mark_open(work: WorkingSet, group: int) -> None:
     work.counter[OPENED] += 1
 
 
-@compiled
+@compiled_bare
+def first_of(program: Program, work: WorkingSet, group: int) -> int:
+    """First member of a group, or the number of members."""
+    n = work.counter[WORKING]
+    for j in range(n):
+        if program.places.group[work.row[j]] == group:
+            return int(j)
+    return int(n)
+
+
+@compiled_bare
 def close_group(program: Program, work: WorkingSet, place: int) -> bool:
     """Hold an opened group's slack at zero; return whether the members stay independent."""
     group = work.opened[place]
@@ -297,28 +321,24 @@ def close_group(program: Program, work: WorkingSet, place: int) -> bool:
     work.opened[place] = work.opened[work.counter[OPENED]]
     work.is_open[group], work.slack[group] = False, 0.0
     n = work.counter[WORKING]
-    first = n
-    for j in range(n - 1, -1, -1):
-        if program.place[program.u, work.row[j], GROUP] == group:
-            first = j
-    return bool(factorise(program, work, first, n) == n)
+    return bool(factorise(program, work, first_of(program, work, group), n) == n)
 
 
-@compiled
+@compiled_bare
 def sums(program: Program, work: WorkingSet) -> None:
     """Sum the multipliers of each group and set its slack."""
     n = work.counter[WORKING]
     for j in range(n):
-        work.total[program.place[program.u, work.row[j], GROUP]] = 0.0
+        work.total[program.places.group[work.row[j]]] = 0.0
     for j in range(n):
-        work.total[program.place[program.u, work.row[j], GROUP]] += work.mult[j]
+        work.total[program.places.group[work.row[j]]] += work.mult[j]
     for j in range(n):
-        group = program.place[program.u, work.row[j], GROUP]
+        group = program.places.group[work.row[j]]
         if work.is_open[group]:
             work.slack[group] = (work.total[group] - work.w1[group]) / work.w2[group]
 
 
-@compiled
+@compiled_bare
 def respond(work: WorkingSet, base: Array, signals: Array) -> None:
     """Signals under the working set's multipliers."""
     for i in range(len(base)):
@@ -329,28 +349,56 @@ def respond(work: WorkingSet, base: Array, signals: Array) -> None:
             signals[i] += mult * column[i]
 
 
-@compiled
+@compiled_bare
 def violation_of(program: Program, work: WorkingSet, row: int, signals: Array) -> tuple[float, float]:
     """By how much a row is violated, less than zero if it is met, and on which side."""
     value = row_value(program, row, signals)
-    under, over = program.number[program.u, row, LOW] - value, value - program.number[program.u, row, HIGH]
-    slack = work.slack[program.place[program.u, row, GROUP]]
+    under, over = program.number[program.u, LOW, row] - value, value - program.number[program.u, HIGH, row]
+    slack = work.slack[program.places.group[row]]
     return (under - slack, 1.0) if under >= over else (over - slack, -1.0)
 
 
-@compiled
-def find_suspects(program: Program, work: WorkingSet, signals: Array) -> None:
+@compiled_bare
+def look(program: Program, work: WorkingSet, f: int, plane: Array) -> int:
+    """Write values and violations of a family's rows for signals (13, N); return how many are violated."""
+    places, u, hits = program.places, program.u, 0
+    a, b, c, d = places.axis[f, 0], places.axis[f, 1], places.axis[f, 2], places.axis[f, 3]
+    g = places.shelf[f]
+    if places.wide[f] == 0:
+        for k in range(plane.shape[1]):
+            value = program.plane[u, 0, f, k] * plane[a, k]
+            value += program.plane[u, 1, f, k] * plane[b, k]
+            work.value[f, k] = value + program.plane[u, 2, f, k] * plane[c, k]
+    else:
+        for k in range(plane.shape[1]):
+            value = program.plane[u, 0, f, k] * plane[a, k]
+            value += program.plane[u, 1, f, k] * plane[b, k]
+            value += program.plane[u, 2, f, k] * plane[c, k]
+            work.value[f, k] = value + program.plane[u, 3, f, k] * plane[d, k]
+    # A loop of its own: with more arrays in one, compilers do not look whether they overlap, and give up.
+    for k in range(plane.shape[1]):
+        value = work.value[f, k]
+        under, over = program.plane[u, LOW, f, k] - value, value - program.plane[u, HIGH, f, k]
+        miss = (under if under >= over else over) - work.shelf[g, k]
+        work.miss[f, k] = miss
+        hits += miss > TOUCH
+    return hits
+
+
+@compiled_bare
+def find_suspects(program: Program, work: WorkingSet, plane: Array) -> None:
     """Look at all rows and note those that are violated."""
-    count = 0
-    for r in range(program.rows):
-        violation, _ = violation_of(program, work, r, signals)
-        if violation > TOUCH:
-            work.suspect[count] = r
-            count += 1
+    stages, count = plane.shape[1], 0
+    for f in range(len(program.places.wide)):
+        if look(program, work, f, plane) > 0:
+            for k in range(stages):
+                if work.miss[f, k] > TOUCH:
+                    work.suspect[count] = f * stages + k
+                    count += 1
     work.counter[SUSPECTS] = count
 
 
-@compiled
+@compiled_bare
 def most_violated(
     program: Program, work: WorkingSet, signals: Array, floor: float
 ) -> tuple[int, float, float]:
@@ -360,7 +408,7 @@ def most_violated(
         r = work.suspect[e]
         violation, side = violation_of(program, work, r, signals)
         if violation > most:
-            bound = program.number[program.u, r, LOW] if side > 0.0 else program.number[program.u, r, HIGH]
+            bound = program.number[program.u, LOW, r] if side > 0.0 else program.number[program.u, HIGH, r]
             kept = SET_ASIDE | (1 if side > 0.0 else 2)
             if violation > TOUCH * max(1.0, abs(bound)) and not work.member[r] & kept:
                 found, where, most = r, side, violation
@@ -371,26 +419,26 @@ def most_violated(
     return found, where, most if most > floor else 0.0
 
 
-@compiled
+@compiled_bare
 def lower_bound(program: Program, row: int, side: float) -> float:
     """Bound of a row on the side where it stands, as that of ``side * row >= bound``."""
     if side > 0.0:
-        return float(program.number[program.u, row, LOW])
-    return -float(program.number[program.u, row, HIGH])
+        return float(program.number[program.u, LOW, row])
+    return -float(program.number[program.u, HIGH, row])
 
 
-@compiled
+@compiled_bare
 def largest_miss(program: Program, work: WorkingSet, signals: Array) -> float:
     """By how much the members miss their bounds at most."""
     most = 0.0
     for j in range(work.counter[WORKING]):
         row, side = work.row[j], work.side[j]
         miss = lower_bound(program, row, side) - side * row_value(program, row, signals)
-        most = max(most, abs(miss - work.slack[program.place[program.u, row, GROUP]]))
+        most = max(most, abs(miss - work.slack[program.places.group[row]]))
     return most
 
 
-@compiled
+@compiled_bare
 def polish(program: Program, work: WorkingSet, signals: Array) -> bool:
     """Correct the multipliers for what the members miss their bounds by; return whether it mattered."""
     n = work.counter[WORKING]
@@ -399,7 +447,7 @@ def polish(program: Program, work: WorkingSet, signals: Array) -> bool:
         row, side = work.row[j], work.side[j]
         bound = lower_bound(program, row, side)
         work.step[j] = bound - side * row_value(program, row, signals)
-        work.step[j] -= work.slack[program.place[program.u, row, GROUP]]
+        work.step[j] -= work.slack[program.places.group[row]]
         matters = matters or abs(work.step[j]) > 0.1 * TOUCH * max(1.0, abs(bound))
     if matters:
         forward(work, n, work.step)
@@ -409,7 +457,7 @@ def polish(program: Program, work: WorkingSet, signals: Array) -> bool:
     return matters
 
 
-@compiled
+@compiled_bare
 def rounding(program: Program, work: WorkingSet, n: int) -> float:
     """How exactly the row behind n members can be known under their multipliers."""
     total = 0.0
@@ -418,10 +466,11 @@ def rounding(program: Program, work: WorkingSet, n: int) -> float:
     return float(TOUCH + ROUNDING * total)
 
 
-@compiled
+@compiled_bare
 def ascend(
-    program: Program, maps: SignalMaps, work: WorkingSet, base: Array, signals: Array, limit: int
-) -> int:
+    program: Program, maps: SignalMaps, work: WorkingSet, base: Array, signals: Array, plane: Array,
+    limit: int,
+) -> int:  # fmt: skip
     """Go on from a working set whose multipliers are feasible to the optimum.
 
     Parameters
@@ -436,6 +485,8 @@ def ascend(
         Signals of the optimum without rows.
     signals : array, shape (13 N,)
         Where the signals of the optimum go.
+    plane : array, shape (13, N)
+        The same memory.
     limit : int
         Steps at most, counted in the working set.
 
@@ -445,7 +496,7 @@ def ascend(
         :data:`OPTIMAL`, :data:`INFEASIBLE` or :data:`LIMIT`.
     """
     work.counter[SUSPECTS] = 0
-    for r in range(program.rows):
+    for r in range(len(work.member)):
         work.member[r] &= 3
     while True:
         sums(program, work)
@@ -458,7 +509,7 @@ def ascend(
             floor = 4.0 * largest_miss(program, work, signals)
         found, side, violation = most_violated(program, work, signals, floor)
         if violation == 0.0:
-            find_suspects(program, work, signals)
+            find_suspects(program, work, plane)
             found, side, violation = most_violated(program, work, signals, floor)
         if violation == 0.0:
             return OPTIMAL
@@ -466,7 +517,7 @@ def ascend(
         if is_row:
             enter(program, maps, work, found, side)
             work.member[found] += 1 if side > 0.0 else 2
-            group = program.place[program.u, found, GROUP]
+            group = program.places.group[found]
         else:
             group = work.opened[-1 - found]
         waiting = 1 if is_row else 0
@@ -477,7 +528,7 @@ def ascend(
             n = work.counter[WORKING]
             # How much of the new row is new.
             for j in range(n):
-                shared = bond(work, group, program.place[program.u, work.row[j], GROUP])
+                shared = bond(work, group, program.places.group[work.row[j]])
                 work.part[j] = work.gram[work.slot[n], work.slot[j]] + shared if is_row else shared
             whole = bond(work, group, group)
             if is_row:
@@ -494,7 +545,7 @@ def ascend(
             # Without a full step to compare with, rounding must not pass for a multiplier that shrinks.
             noise, largest = 0.0 if independent else NOISE * np.sqrt(whole), 1.0
             for j in range(n):
-                work.rate[program.place[program.u, work.row[j], GROUP]] = 0.0
+                work.rate[program.places.group[work.row[j]]] = 0.0
                 largest = max(largest, abs(work.step[j]))
                 own = noise / np.sqrt(work.gram[work.slot[j], work.slot[j]]) if noise > 0.0 else 0.0
                 if work.step[j] > own and work.mult[j] < length * work.step[j]:
@@ -502,10 +553,10 @@ def ascend(
             if is_row:
                 work.rate[group] = 1.0
             for j in range(n):
-                work.rate[program.place[program.u, work.row[j], GROUP]] -= work.step[j]
+                work.rate[program.places.group[work.row[j]]] -= work.step[j]
             noise = 0.0 if independent else NOISE * largest
             for j in range(n + waiting):
-                other = program.place[program.u, work.row[j], GROUP]
+                other = program.places.group[work.row[j]]
                 if not work.is_open[other] and work.rate[other] > noise:
                     room = max(0.0, work.w1[other] - work.total[other])
                     if room < length * work.rate[other]:
@@ -544,27 +595,36 @@ def ascend(
             return LIMIT
 
 
-@compiled
+@compiled_bare
+def forget(program: Program, work: WorkingSet, j: int) -> None:
+    """Take member j out of the working set; the factor then holds for the members before it only."""
+    n = work.counter[WORKING]
+    for k in range(j):
+        for i in range(j, n - 1):
+            work.factor[k, i] = work.factor[k, i + 1]
+    release(program, work, j, n)
+    work.counter[WORKING] = n - 1
+
+
+@compiled_bare
 def resume(program: Program, work: WorkingSet, base: Array) -> None:
     """Multipliers of a working set guessed, less what cannot be: dependent rows, multipliers below zero.
 
     Members, columns, Gram entries and open groups must be set; the result is a state from which
     :func:`ascend` goes on.
     """
+    first = 0
     while True:
         n = work.counter[WORKING]
-        bad = factorise(program, work, 0, n)
+        bad = factorise(program, work, first, n)
         while bad < n:
-            for k in range(bad):
-                for i in range(bad, n - 1):
-                    work.factor[k, i] = work.factor[k, i + 1]
-            release(program, work, bad, n)
+            forget(program, work, bad)
             n -= 1
-            work.counter[WORKING] = n
             bad = factorise(program, work, bad, n)
+        first = n
         for j in range(n):
             row, side = work.row[j], work.side[j]
-            group = program.place[program.u, row, GROUP]
+            group = program.places.group[row]
             work.mult[j] = lower_bound(program, row, side) - side * row_value(program, row, base)
             if work.is_open[group]:
                 work.mult[j] += work.w1[group] / work.w2[group]
@@ -573,17 +633,16 @@ def resume(program: Program, work: WorkingSet, base: Array) -> None:
         sound = True
         for j in range(n - 1, -1, -1):
             if not work.mult[j] > 0.0:
-                release(program, work, j, work.counter[WORKING])
-                work.counter[WORKING] -= 1
-                sound = False
+                forget(program, work, j)
+                first, sound = j, False
         n = work.counter[WORKING]
         if sound:
             sums(program, work)
             for j in range(n):
-                group = program.place[program.u, work.row[j], GROUP]
+                group = program.places.group[work.row[j]]
                 if not work.is_open[group] and work.total[group] > work.w1[group]:
                     mark_open(work, group)
-                    sound = False
+                    first, sound = min(first, first_of(program, work, group)), False
         work.counter[STEPS] += 1
         if sound:
             break

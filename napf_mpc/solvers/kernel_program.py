@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
 from napf_mpc.solvers.kernel_active_set import (
+    INFEASIBLE,
     LIMIT,
     OPTIMAL,
     STEPS,
@@ -18,6 +19,7 @@ from napf_mpc.solvers.kernel_active_set import (
     WorkingSet,
     ascend,
     enter,
+    look,
     lower_bound,
     mark_open,
     polish,
@@ -25,151 +27,137 @@ from napf_mpc.solvers.kernel_active_set import (
     resume,
     row_value,
     sums,
-    working_set,
 )
-from napf_mpc.solvers.kernel_rows import (
-    GROUP,
-    GROUPS,
-    HIGH,
-    LOW,
-    ROWS,
-    USABLE,
-    WIDTH,
-    Y_HIGH,
-    Y_LOW,
-    RowTable,
+from napf_mpc.solvers.kernel_rows import HIGH, LOW, W1, W2, WIDTH, RowPlaces, RowTable
+from napf_mpc.solvers.kernel_signals import SignalMaps
+from napf_mpc.solvers.kernel_sweep import (
+    Lanes,
+    clear,
+    read_signals,
+    stationarity,
+    sweep,
+    take,
 )
-from napf_mpc.solvers.kernel_signals import Q, SignalMaps, read_signals, stationarity, sweep
 
-ROUGH, UNUSABLE = 3, 4
-"""Further ends of a program: the certificate is not met; a number is not sound."""
-EXACT = 1e-9
-"""Largest KKT residual of a solved program, over one or its own largest term."""
+ROUGH, UNUSABLE, ALONE = 3, 4, 5
+"""Further ends of a program: the certificate is not met; a number is not sound; it is to be solved alone."""
+EXACT, PLAIN = 1e-9, 1e-10
+"""Largest KKT residual of a solved program, over one or its own largest term; and of one that is solved
+without corrections."""
 ROUNDS = 4
 """Corrections of the signals by exact sweeps at most; one is the rule."""
 CLOSE = 1e-12
 """A correction of the signals smaller than this, over one or the bound it moves against, ends the rounds."""
 SOFTEST = 1e-3
 """A slack whose quadratic price is below this part of its rows' stiffness is solved by proximal steps."""
+SOFTEST_ALONE = 1e-9
+"""The same for a slack of one row without a linear price."""
 PROXIMAL_STEPS = 60
 """Proximal steps at most; each leaves at most a thousandth of the error."""
+LOOK = 32
+"""Guessed multipliers looked at together: most are zero."""
 GUESSED = 1e-9
 """A guessed multiplier or slack above this means an active row or an open slack."""
 
 
 class Room(NamedTuple):
-    """Arrays that one program needs beside its working set."""
+    """Arrays that one program needs beside its working set and its lane."""
 
-    linear: Array
-    """(N, 12) -Q ref."""
-    pull: Array
-    """(N, 12)."""
-    push: Array
-    """(N, 4)."""
-    feed: Array
-    """(N, 4)."""
-    cost: Array
-    """(N, 12)."""
-    states: Array
-    """(N, 12)."""
-    inputs: Array
-    """(N, 4)."""
-    costates: Array
-    """(N, 12)."""
     base: Array
     """(13 N,) signals of the optimum without rows."""
     signals: Array
     """(13 N,) signals by the kernel."""
+    plane: Array
+    """(13, N) the same memory."""
     exact: Array
     """(13 N,) signals by the sweep."""
-    force: Array
-    """(13 N,)."""
-    loads: Array
-    """(N, 16)."""
-    weighed: Array
-    """(N, 16)."""
-    carried: Array
-    """(N, 16)."""
+    exact_plane: Array
+    """(13, N) the same memory."""
     certificate: Array
     """(6,) residual and largest term: primal, dual, complementarity."""
     previous: Array
-    """(groups,) last slack of a group that needs proximal steps."""
+    """(soft groups,) last slack of a group that needs proximal steps."""
     extra: Array
-    """(groups,) what those add to its quadratic price; zero for all others."""
+    """(soft groups,) what those add to its quadratic price; zero for all others."""
+    was_open: NDArray[np.bool_]
+    """(soft groups,) groups open before a proximal step."""
+    row: Index
+    """(capacity,) members before it."""
+    side: Array
+    """(capacity,) their sides."""
+
+    @classmethod
+    def empty(cls, stages: int, soft: int, members: int) -> Room:
+        """Room for programs of a size."""
+        shape = (STATES + 1, stages)
+        plane, exact = np.zeros(shape), np.zeros(shape)
+        return cls(
+            np.zeros(plane.size), plane.reshape(-1), plane, exact.reshape(-1), exact, np.zeros(6),
+            np.zeros(soft), np.zeros(soft), np.zeros(soft, dtype=np.bool_),
+            np.zeros(members, dtype=np.int64), np.zeros(members),
+        )  # fmt: skip
 
 
-@compiled
-def make_room(stages: int, groups: int) -> Room:
-    """Room for programs of a size."""
-    signals, both = (STATES + 1) * stages, STATES + INPUTS
-    return Room(
-        np.zeros((stages, STATES)), np.zeros((stages, STATES)), np.zeros((stages, INPUTS)),
-        np.zeros((stages, INPUTS)), np.zeros((stages, STATES)), np.zeros((stages, STATES)),
-        np.zeros((stages, INPUTS)), np.zeros((stages, STATES)),
-        np.zeros(signals), np.zeros(signals), np.zeros(signals), np.zeros(signals),
-        np.zeros((stages, both)), np.zeros((stages, both)), np.zeros((stages, both)),
-        np.zeros(6), np.zeros(groups), np.zeros(groups),
-    )  # fmt: skip
+class Kept(NamedTuple):
+    """Working sets of some programs while their plans are made side by side."""
+
+    end: Index
+    """(program,) how each ended so far, or :data:`ALONE`."""
+    steps: Index
+    """(program,)."""
+    count: Index
+    """(program,) members."""
+    row: Index
+    """(program, capacity)."""
+    side: Array
+    """(program, capacity)."""
+    mult: Array
+    """(program, capacity)."""
+    slack: Array
+    """(program, soft group)."""
+    total: Array
+    """(program, soft group)."""
+    is_open: NDArray[np.bool_]
+    """(program, soft group)."""
+
+    @classmethod
+    def empty(cls, programs: int, soft: int, members: int) -> Kept:
+        """Room for so many programs."""
+        wholes = [np.zeros(programs, dtype=np.int64) for _ in range(3)]
+        return cls(
+            *wholes, np.zeros((programs, members), dtype=np.int64), np.zeros((programs, members)),
+            np.zeros((programs, members)), np.zeros((programs, soft)), np.zeros((programs, soft)),
+            np.zeros((programs, soft), dtype=np.bool_),
+        )  # fmt: skip
 
 
-@compiled
-def unconstrained(maps: SignalMaps, room: Room, starts: Array, references: Array, at: int) -> bool:
-    """Signals of the optimum without rows; return whether they are finite."""
-    n = len(room.states)
-    for k in range(n):
-        for i in range(STATES):
-            room.linear[k, i] = 0.0
-        for e in range(maps.begins[Q, k], maps.begins[Q, k + 1]):
-            room.linear[k, maps.row[e]] -= maps.value[e] * references[at, k, maps.column[e]]
-    sweep(maps, starts, at, room.linear, room.push, False, room.feed, room.cost, room.states, room.inputs)
-    read_signals(maps, room.states, room.inputs, room.base)
-    finite = True
-    for i in range(len(room.base)):
-        finite = finite and np.isfinite(room.base[i])
-    for k in range(n):
-        for i in range(STATES):
-            finite = finite and np.isfinite(room.states[k, i])
-    return finite
-
-
-@compiled
-def under_load(
-    maps: SignalMaps, program: Program, work: WorkingSet, room: Room, starts: Array, at: int
-) -> None:
-    """States, inputs and exact signals under the working set's multipliers."""
-    for i in range(len(room.force)):
-        room.force[i] = 0.0
+@compiled_bare
+def load(maps: SignalMaps, program: Program, work: WorkingSet, lanes: Lanes, lane: int) -> None:
+    """Put the working set's forces into a lane without any."""
     for j in range(work.counter[WORKING]):
         row, weight = work.row[j], work.side[j] * work.mult[j]
         for d in range(WIDTH):
-            room.force[program.place[program.u, row, d]] += weight * program.number[program.u, row, d]
-    for k in range(len(room.pull)):
-        for i in range(STATES):
-            room.pull[k, i] = room.linear[k, i]
-        for i in range(INPUTS):
-            room.push[k, i] = 0.0
-    for i in range(len(room.force)):
-        k, target = maps.stage[i], maps.target[i]
-        if target < STATES:
-            room.pull[k, target] -= room.force[i]
-        else:
-            room.push[k, target - STATES] -= room.force[i]
-    sweep(maps, starts, at, room.pull, room.push, True, room.feed, room.cost, room.states, room.inputs)
-    read_signals(maps, room.states, room.inputs, room.exact)
+            i = program.places.signal[d, row]
+            lanes.loads[maps.stage[i], maps.target[i], lane] += weight * program.number[program.u, d, row]
 
 
-@compiled
+@compiled_bare
+def under_load(maps: SignalMaps, program: Program, work: WorkingSet, room: Room, lanes: Lanes) -> None:
+    """Plan and exact signals under the working set's multipliers, in the only lane."""
+    clear(lanes.loads)
+    load(maps, program, work, lanes, 0)
+    sweep(maps, lanes, True)
+    read_signals(maps, lanes, 0, room.exact)
+
+
+@compiled_bare
 def correct(program: Program, work: WorkingSet, room: Room) -> bool:
     """Move the base by what the kernel's signals are off; return whether it mattered to any row."""
     matters = False
     for j in range(work.counter[WORKING]):
         row, side = work.row[j], work.side[j]
         bound = lower_bound(program, row, side)
-        gap = (
-            bound
-            - side * row_value(program, row, room.exact)
-            - work.slack[program.place[program.u, row, GROUP]]
-        )
+        gap = bound - side * row_value(program, row, room.exact) - work.slack[program.places.group[row]]
         matters = matters or abs(gap) > CLOSE * max(1.0, abs(bound))
     for i in range(len(room.base)):
         shift = room.exact[i] - room.signals[i]
@@ -178,202 +166,230 @@ def correct(program: Program, work: WorkingSet, room: Room) -> bool:
     return matters
 
 
-@compiled
+@compiled_bare
 def solve_rows(
-    maps: SignalMaps, program: Program, work: WorkingSet, room: Room, starts: Array, at: int, limit: int
+    maps: SignalMaps, program: Program, work: WorkingSet, room: Room, lanes: Lanes, limit: int
 ) -> int:
-    """Optimum with rows from the working set as it is; states and inputs are in the room."""
+    """Optimum with rows from the working set as it is; the plan is in the only lane."""
     status = LIMIT
     for _ in range(ROUNDS):
-        status = ascend(program, maps, work, room.base, room.signals, limit)
+        status = ascend(program, maps, work, room.base, room.signals, room.plane, limit)
         if status != OPTIMAL:
             return status
-        under_load(maps, program, work, room, starts, at)
+        under_load(maps, program, work, room, lanes)
         if not correct(program, work, room):
             break
         polish(program, work, room.exact)
     else:
         sums(program, work)
-        under_load(maps, program, work, room, starts, at)
+        under_load(maps, program, work, room, lanes)
     return status
 
 
-@compiled
+@compiled_bare
 def proximal(
     program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room
 ) -> bool:
     """Give slacks with next to no quadratic price one of their own; return whether there are any."""
-    any_soft = False
-    for g in range(table.size[u, GROUPS]):
+    soft, stages, any_soft = table.price.shape[2], table.plane.shape[3], False
+    for g in range(soft):
+        work.w1[g], work.w2[g] = table.price[u, W1, g], table.price[u, W2, g]
+    for g in range(soft):
         room.previous[g], room.extra[g] = 0.0, 0.0
-        work.w1[g], work.w2[g] = table.price[u, g, 0], table.price[u, g, 1]
-    for r in range(program.rows):
-        g = program.place[program.u, r, GROUP]
-        if g == table.price.shape[1] - 1:
+    for f in range(len(program.places.wide)):
+        shelf, lonely, near = program.places.shelf[f], program.places.lonely[f], 0
+        if shelf == table.shelves.shape[2]:
             continue
-        size = 0.0
-        for d in range(WIDTH):
-            size += program.number[program.u, r, d] ** 2
-        # An upper bound of the row's own Gram entry first: it is cheap.
-        if table.price[u, g, 1] * size * 4.0 * maps.softest < SOFTEST:
-            give = 0.0
+        for k in range(stages):
+            size = 0.0
+            for d in range(WIDTH):
+                size += table.plane[u, d, f, k] * table.plane[u, d, f, k]
+            # A linear price, or a row that shares the slack, would drown in a slack so soft. A row alone
+            # without one yields, that is all.
+            alone = lonely & (table.shelves[u, W1, shelf, k] == 0.0)
+            least = SOFTEST_ALONE if alone else SOFTEST
+            finite = (table.plane[u, LOW, f, k] > -np.inf) | (table.plane[u, HIGH, f, k] < np.inf)
+            # An upper bound of the row's own Gram entry first: it is cheap.
+            near += (table.shelves[u, W2, shelf, k] * size * 4.0 * maps.softest < least) & finite
+        if near == 0:
+            continue
+        for r in range(f * stages, f * stages + stages):
+            g, give = program.places.group[r], 0.0
+            alone = lonely & (table.price[u, W1, g] == 0.0)
+            if table.number[u, LOW, r] == -np.inf and table.number[u, HIGH, r] == np.inf:
+                continue
             for d in range(WIDTH):
                 for e in range(WIDTH):
-                    pair = maps.kernel[program.place[program.u, r, d], program.place[program.u, r, e]]
-                    give += program.number[program.u, r, d] * program.number[program.u, r, e] * pair
-            least = SOFTEST / give if give > 0.0 else 1.0
-            room.extra[g] = max(room.extra[g], least - table.price[u, g, 1])
+                    pair = maps.kernel[program.places.signal[d, r], program.places.signal[e, r]]
+                    give += program.number[u, d, r] * program.number[u, e, r] * pair
+            least = SOFTEST_ALONE if alone else SOFTEST
+            softest = least / give if give > 0.0 else 1.0
+            room.extra[g] = max(room.extra[g], softest - table.price[u, W2, g])
             any_soft = any_soft or room.extra[g] > 0.0
-    for g in range(table.size[u, GROUPS]):
-        work.w2[g] = table.price[u, g, 1] + room.extra[g]
+    for g in range(soft):
+        work.w2[g] = table.price[u, W2, g] + room.extra[g]
     return any_soft
 
 
-@compiled
+@compiled_bare
+def join(program: Program, maps: SignalMaps, work: WorkingSet, row: int, side: float) -> None:
+    """Make a row a member while there is room; the factor is not touched."""
+    if work.counter[WORKING] < len(work.row) - 2:
+        enter(program, maps, work, row, side)
+        work.member[row] += 1 if side > 0.0 else 2
+        work.counter[WORKING] += 1
+
+
+@compiled_bare
 def guess(
     program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, z: Array, y: Array, at: int
 ) -> bool:
     """Take the rows that push in a guess as members, and its slacks as open; return whether it is finite."""
+    lost = 0
     for i in range(z.shape[1]):
-        if not np.isfinite(z[at, i]):
-            return False
+        # NaN fails every comparison.
+        lost += not abs(z[at, i]) < np.inf
     for i in range(y.shape[1]):
-        if not np.isfinite(y[at, i]):
-            return False
-    for g in range(table.size[u, GROUPS]):
-        if work.w1[g] > 0.0 and z[at, table.put[u, g, 0]] > GUESSED:
+        lost += not abs(y[at, i]) < np.inf
+    if lost > 0:
+        return False
+    for g in range(table.price.shape[2]):
+        if work.w1[g] > 0.0 and z[at, program.places.slack_z[g]] > GUESSED:
             mark_open(work, g)
-    for r in range(program.rows):
-        for side in (1.0, -1.0):
-            bound = lower_bound(program, r, side)
-            pushing = -y[at, table.place[u, r, Y_LOW]] if side > 0.0 else y[at, table.place[u, r, Y_HIGH]]
-            if bound > -np.inf and pushing > GUESSED and work.counter[WORKING] < len(work.row) - 2:
-                enter(program, maps, work, r, side)
-                work.member[r] += 1 if side > 0.0 else 2
-                work.counter[WORKING] += 1
+    spans = program.places.span
+    for b in range(len(spans)):
+        for first in range(spans[b, 0], spans[b, 1], LOOK):
+            last, pushing = min(first + LOOK, spans[b, 1]), 0
+            for m in range(max(first, 0), last):
+                pushing += abs(y[at, m]) > GUESSED
+            if pushing == 0:
+                continue
+            for m in range(max(first, 0), last):
+                r = program.places.owner[m]
+                if -y[at, m] > GUESSED and program.number[program.u, LOW, r] > -np.inf:
+                    join(program, maps, work, r, 1.0)
+                if y[at, m] > GUESSED and program.number[program.u, HIGH, r] < np.inf:
+                    join(program, maps, work, r, -1.0)
     return True
 
 
-@compiled
+@compiled_bare
 def again(program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room) -> bool:
     """Take a proximal step: prices from the slacks reached; return whether they had moved."""
     moved = False
-    for g in range(table.size[u, GROUPS]):
+    for g in range(table.price.shape[2]):
         if room.extra[g] > 0.0:
             reached = max(0.0, work.slack[g])
             off = room.extra[g] * abs(reached - room.previous[g])
-            moved = moved or off > CLOSE * max(1.0, table.price[u, g, 0])
+            moved = moved or off > CLOSE * max(1.0, table.price[u, W1, g])
             room.previous[g] = reached
     if not moved:
         return False
     count = work.counter[WORKING]
-    rows, sides = work.row[:count].copy(), work.side[:count].copy()
-    was_open = work.is_open.copy()
-    for g in range(table.size[u, GROUPS]):
-        work.w1[g] = table.price[u, g, 0] - room.extra[g] * room.previous[g]
-    reset(work, program.rows, table.size[u, GROUPS])
-    for g in range(table.size[u, GROUPS]):
-        if was_open[g] and not work.is_open[g]:
+    for j in range(count):
+        room.row[j], room.side[j] = work.row[j], work.side[j]
+    for g in range(table.price.shape[2]):
+        work.w1[g] = table.price[u, W1, g] - room.extra[g] * room.previous[g]
+        room.was_open[g] = work.is_open[g]
+    reset(work, table.price.shape[2])
+    for g in range(table.price.shape[2]):
+        if room.was_open[g] and not work.is_open[g]:
             mark_open(work, g)
     for j in range(count):
-        enter(program, maps, work, rows[j], sides[j])
-        work.member[rows[j]] += 1 if sides[j] > 0.0 else 2
-        work.counter[WORKING] += 1
+        join(program, maps, work, room.row[j], room.side[j])
     resume(program, work, room.base)
     return True
 
 
-@compiled
+@compiled_bare
 def certify(
-    maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room,
-    starts: Array, at: int, z: Array, y: Array,
+    program: Program, table: RowTable, u: int, work: WorkingSet, room: Room, lanes: Lanes, lane: int,
+    at: int, z: Array, y: Array,
 ) -> float:  # fmt: skip
-    """Write slacks, multipliers and residuals of the original program; return the largest relative one."""
-    out = room.certificate
-    stationarity(
-        maps, starts, at, room.states, room.inputs, room.cost, room.linear, room.force,
-        room.costates, room.loads, room.weighed, room.carried, out,
-    )  # fmt: skip
-    n = len(room.states)
+    """Write plan, slacks, multipliers and residuals of the original program; return the largest relative one.
+
+    The lane's plan must be in balance, see :func:`~napf_mpc.solvers.kernel_sweep.stationarity`, and its
+    signals in the room.
+    """
+    out, n = room.certificate, lanes.states.shape[0]
+    for e in range(6):
+        out[e] = lanes.balance[e, lane]
     for k in range(n):
         for i in range(STATES):
-            z[at, k * STATES + i] = room.states[k, i]
-            y[at, k * STATES + i] = room.costates[k, i]
+            z[at, k * STATES + i] = lanes.states[k, i, lane]
+            y[at, k * STATES + i] = lanes.costates[k, i, lane]
         for i in range(INPUTS):
-            z[at, n * STATES + k * INPUTS + i] = room.inputs[k, i]
-    for g in range(table.size[u, GROUPS]):
+            z[at, n * STATES + k * INPUTS + i] = lanes.inputs[k, i, lane]
+    off, largest, product = out[2], out[3], out[4]
+    for g in range(table.price.shape[2]):
         slack = max(0.0, work.slack[g])
-        w1, w2, total = table.price[u, g, 0], table.price[u, g, 1], work.total[g]
+        w1, w2, total = table.price[u, W1, g], table.price[u, W2, g], work.total[g]
         mult = 0.0 if work.is_open[g] and slack > 0.0 else max(0.0, w1 + w2 * slack - total)
-        z[at, table.put[u, g, 0]], y[at, table.put[u, g, 1]] = slack, -mult
-        out[2] = max(out[2], abs(w1 + w2 * slack - total - mult))
-        out[3] = max(out[3], w1, w2 * slack, total)
-        out[4] = max(out[4], mult * slack)
+        z[at, program.places.slack_z[g]], y[at, program.places.slack_y[g]] = slack, -mult
+        if total != 0.0 or slack > 0.0:
+            off = max(off, abs(w1 + w2 * slack - total - mult))
+            largest = max(largest, max(w1, max(w2 * slack, total)))
+            product = max(product, mult * slack)
         work.slack[g] = slack
-    for r in range(program.rows):
-        value, slack = row_value(program, r, room.exact), work.slack[program.place[program.u, r, GROUP]]
-        low, high = program.number[program.u, r, LOW], program.number[program.u, r, HIGH]
-        out[0] = max(out[0], low - value - slack, value - high - slack)
-        out[1] = max(out[1], abs(value))
+    out[2], out[3] = off, largest
+    missed, size = out[0], out[1]
+    for f in range(len(program.places.wide)):
+        look(program, work, f, room.exact_plane)
+        for k in range(n):
+            missed, size = max(missed, work.miss[f, k]), max(size, abs(work.value[f, k]))
+    out[0], out[1] = missed, size
+    largest = out[5]
     for j in range(work.counter[WORKING]):
         row, side, mult = work.row[j], work.side[j], work.mult[j]
         bound = lower_bound(program, row, side)
-        gap = (
-            bound
-            - side * row_value(program, row, room.exact)
-            - work.slack[program.place[program.u, row, GROUP]]
-        )
-        out[4] = max(out[4], mult * abs(gap))
-        out[5] = max(out[5], mult * abs(bound))
+        gap = bound - side * row_value(program, row, room.exact) - work.slack[program.places.group[row]]
+        product, largest = max(product, mult * abs(gap)), max(largest, mult * abs(bound))
         if side > 0.0:
-            y[at, table.place[u, row, Y_LOW]] -= mult
+            y[at, program.places.y_low[row]] -= mult
         else:
-            y[at, table.place[u, row, Y_HIGH]] += mult
-    worst = 0.0
+            y[at, program.places.y_high[row]] += mult
+    out[4], out[5] = product, largest
+    worst = 0.0 if lanes.lost[lane] == 0 else np.inf
     for e in range(0, 6, 2):
         relative = out[e] / max(1.0, out[e + 1])
-        # NaN would lose the comparison.
         worst = max(worst, relative) if relative < np.inf else np.inf
     return worst
 
 
-@compiled
-def clear_multipliers(program: Program, table: RowTable, u: int, y: Array, at: int) -> None:
+@compiled_bare
+def clear_multipliers(program: Program, y: Array, at: int) -> None:
     """Zero the multipliers of all rows before they are written again."""
-    for r in range(program.rows):
-        y[at, table.place[u, r, Y_LOW]], y[at, table.place[u, r, Y_HIGH]] = 0.0, 0.0
+    for r in range(len(program.places.group)):
+        y[at, program.places.y_low[r]], y[at, program.places.y_high[r]] = 0.0, 0.0
 
 
-@compiled
-def solve_one(
-    maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room, starts: Array,
-    references: Array, at: int, warm: bool, guess_z: Array, guess_y: Array, guess_at: int,
-    limit: int, z: Array, y: Array,
+@compiled_bare
+def solve_alone(
+    maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room, lanes: Lanes,
+    at: int, warm: bool, guess_z: Array, guess_y: Array, guess_at: int, limit: int, z: Array, y: Array,
 ) -> int:  # fmt: skip
-    """Solve program u of a table; return how it ended."""
-    if table.size[u, USABLE] == 0 or not unconstrained(maps, room, starts, references, at):
-        return UNUSABLE
-    program = Program(table.number, table.place, u, table.size[u, ROWS])
+    """Solve a program in the only lane, with corrections and proximal steps; return how it ended."""
     work.counter[STEPS] = 0
+    status = LIMIT
     for attempt in range(2):
-        if attempt == 1:
-            # The corrections of the first attempt go with its multipliers.
-            unconstrained(maps, room, starts, references, at)
+        # The corrections of the first attempt go with its multipliers.
+        sweep(maps, lanes, False)
+        read_signals(maps, lanes, 0, room.base)
         softest = proximal(program, maps, table, u, work, room)
-        reset(work, program.rows, table.size[u, GROUPS])
+        reset(work, table.price.shape[2])
         guessed = warm and attempt == 0 and guess(program, maps, table, u, work, guess_z, guess_y, guess_at)
         if guessed:
             resume(program, work, room.base)
-        status = solve_rows(maps, program, work, room, starts, at, limit)
+        status = solve_rows(maps, program, work, room, lanes, limit)
         if softest:
             for _ in range(PROXIMAL_STEPS):
                 if status != OPTIMAL or not again(program, maps, table, u, work, room):
                     break
-                status = solve_rows(maps, program, work, room, starts, at, limit)
+                status = solve_rows(maps, program, work, room, lanes, limit)
         if status == OPTIMAL:
-            if attempt == 1:
-                clear_multipliers(program, table, u, y, at)
-            if certify(maps, program, table, u, work, room, starts, at, z, y) <= EXACT:
+            clear_multipliers(program, y, at)
+            stationarity(maps, lanes)
+            if certify(program, table, u, work, room, lanes, 0, at, z, y) <= EXACT:
                 return OPTIMAL
             status = ROUGH
         if not guessed or status == LIMIT:
@@ -381,24 +397,69 @@ def solve_one(
     return status
 
 
-@compiled
+@compiled_bare
+def begin(
+    maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room, lanes: Lanes,
+    warm: bool, guess_z: Array, guess_y: Array, guess_at: int, limit: int,
+) -> int:  # fmt: skip
+    """Active set of a program by the kernel's signals; return how it ended, or that it wants more care."""
+    work.counter[STEPS] = 0
+    if proximal(program, maps, table, u, work, room):
+        return ALONE
+    read_signals(maps, lanes, u, room.base)
+    reset(work, table.price.shape[2])
+    guessed = warm and guess(program, maps, table, u, work, guess_z, guess_y, guess_at)
+    if guessed:
+        resume(program, work, room.base)
+    status = ascend(program, maps, work, room.base, room.signals, room.plane, limit)
+    return ALONE if guessed and status == INFEASIBLE else status
+
+
+@compiled_bare
+def keep(work: WorkingSet, kept: Kept, u: int) -> None:
+    """Note a program's working set."""
+    kept.count[u], kept.steps[u] = work.counter[WORKING], work.counter[STEPS]
+    for j in range(work.counter[WORKING]):
+        kept.row[u, j], kept.side[u, j], kept.mult[u, j] = work.row[j], work.side[j], work.mult[j]
+    for g in range(kept.slack.shape[1]):
+        kept.slack[u, g], kept.total[u, g] = work.slack[g], work.total[g]
+    for g in range(kept.slack.shape[1]):
+        kept.is_open[u, g] = work.is_open[g]
+
+
+@compiled_bare
+def recall(work: WorkingSet, kept: Kept, u: int) -> None:
+    """Take up a program's working set again, as far as its certificate needs it."""
+    work.counter[WORKING], work.counter[STEPS] = kept.count[u], kept.steps[u]
+    for j in range(kept.count[u]):
+        work.row[j], work.side[j], work.mult[j] = kept.row[u, j], kept.side[u, j], kept.mult[u, j]
+    for g in range(kept.slack.shape[1]):
+        work.slack[g], work.total[g] = kept.slack[u, g], kept.total[u, g]
+    for g in range(kept.slack.shape[1]):
+        work.is_open[g] = kept.is_open[u, g]
+
+
+@compiled_bare
 def solve_programs(
-    maps: SignalMaps, table: RowTable, programs: Index, column: Array, gram: Array, factor: Array,
-    initial: Array, reference: Array, warm: bool, guess_z: Array, guess_y: Array, limit: int,
-    z: Array, y: Array, residuals: Array, ends: NDArray[np.int64], steps: Index,
+    maps: SignalMaps, places: RowPlaces, table: RowTable, programs: Index, work: WorkingSet, room: Room,
+    kept: Kept, lanes: Lanes, single: Lanes, initial: Array, reference: Array, warm: bool,
+    guess_z: Array, guess_y: Array, limit: int, z: Array, y: Array, residuals: Array,
+    ends: NDArray[np.int64], steps: Index,
 ) -> None:  # fmt: skip
-    """Solve all programs of a table, each by itself.
+    """Solve all programs of a table: side by side, then those alone that want more care.
 
     Parameters
     ----------
     maps : SignalMaps
         Model.
+    places : RowPlaces
+        Where their rows stand.
     table : RowTable
         Rows of the programs.
     programs : array of int, shape (programs of the table,)
         Their places in the batch.
-    column, gram, factor : array, shapes (capacity, 13 N) and (capacity, capacity)
-        Room to work in.
+    work, room, kept, lanes, single : WorkingSet, Room, Kept and two Lanes
+        Room to work in; lanes are as many as programs, and a single one.
     initial, reference : array, shapes (batch, 12) and (batch, N, 12)
         As in :class:`~napf_mpc.qp.HorizonQp`.
     warm : bool
@@ -414,18 +475,41 @@ def solve_programs(
     ends, steps : array of int, shape (batch,)
         How each program ended, and after how many steps.
     """
-    groups = table.price.shape[1]
-    work = working_set(column, gram, factor, table.number.shape[1], groups)
-    room = make_room(reference.shape[1], groups)
     for u in range(len(programs)):
-        i = programs[u]
-        g = i if warm else 0
-        ends[i] = solve_one(
-            maps, table, u, work, room, initial, reference, i, warm, guess_z, guess_y, g, limit, z, y
-        )
-        if ends[i] != UNUSABLE:
-            steps[i] = work.counter[STEPS]
-        if ends[i] == OPTIMAL or ends[i] == ROUGH:
+        take(maps, lanes, u, initial, reference, programs[u])
+    sweep(maps, lanes, False)
+    clear(lanes.loads)
+    for u in range(len(programs)):
+        if table.sound[u] == 0 or lanes.lost[u] > 0:
+            kept.end[u] = UNUSABLE
+            continue
+        program = Program(table.number, table.plane, places, u)
+        g = programs[u] if warm else 0
+        kept.end[u] = begin(maps, program, table, u, work, room, lanes, warm, guess_z, guess_y, g, limit)
+        keep(work, kept, u)
+        if kept.end[u] == OPTIMAL:
+            load(maps, program, work, lanes, u)
+    sweep(maps, lanes, True)
+    stationarity(maps, lanes)
+    for u in range(len(programs)):
+        i, end = programs[u], kept.end[u]
+        program = Program(table.number, table.plane, places, u)
+        if end == OPTIMAL:
+            recall(work, kept, u)
+            read_signals(maps, lanes, u, room.exact)
+            if not certify(program, table, u, work, room, lanes, u, i, z, y) <= PLAIN:
+                end = ALONE
+        if end == ALONE:
+            take(maps, single, 0, initial, reference, i)
+            g = i if warm else 0
+            end = solve_alone(
+                maps, program, table, u, work, room, single, i, warm, guess_z, guess_y, g, limit, z, y
+            )
+            kept.steps[u] = work.counter[STEPS]
+        ends[i] = end
+        if end != UNUSABLE:
+            steps[i] = kept.steps[u]
+        if end in (OPTIMAL, ROUGH):
             for e in range(3):
                 residuals[i, e] = room.certificate[2 * e]
         else:

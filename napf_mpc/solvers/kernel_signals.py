@@ -17,7 +17,6 @@ from scipy.linalg import solve_triangular
 from scipy.sparse.csgraph import connected_components
 
 from napf_mpc.constraints.constraint import SIGNALS
-from napf_mpc.jit import compiled
 from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, Index, QpError
 
 KINDS = tuple(SIGNALS)
@@ -50,7 +49,7 @@ class SignalMaps(NamedTuple):
     row: Small
     """(entries,)."""
     column: Small
-    """(entries,) not decreasing within a stage, so that sums do not wait for each other."""
+    """(entries,)."""
     value: Array
     """(entries,)."""
     kernel: Array
@@ -129,8 +128,7 @@ def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Small, Small, Array]:
     begins = np.empty((len(matrices), stages + 1), dtype=np.int64)
     rows, columns, values, count = [], [], [], 0
     for which, matrix in enumerate(matrices):
-        # Column by column: the transpose's entries in order.
-        stage, column, row = np.nonzero(matrix.transpose(0, 2, 1))
+        stage, row, column = np.nonzero(matrix)
         begins[which] = count + np.searchsorted(stage, np.arange(stages + 1))
         rows.append(row)
         columns.append(column)
@@ -184,160 +182,3 @@ def _chains(kernel: Array, stages: int) -> tuple[Index, Index]:
     linked = np.asarray(near.reshape(count, stages, count, stages).any(axis=(1, 3)), dtype=float)
     _, chain = connected_components(linked, directed=False)
     return np.argsort(chain, kind="stable"), chain.astype(np.int64)
-
-
-@compiled
-def add(
-    maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
-) -> None:
-    """Add ``sign matrix vector[at]`` of a matrix of stage k to ``out[to, first:]``.
-
-    Arrays come whole with indices: views of them are counted, which costs more than the sums.
-    """
-    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
-        out[to, first + maps.row[e]] += sign * maps.value[e] * vector[at, maps.column[e]]
-
-
-@compiled
-def add_turned(
-    maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
-) -> None:
-    """The same of the matrix's transpose."""
-    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
-        out[to, first + maps.column[e]] += sign * maps.value[e] * vector[at, maps.row[e]]
-
-
-@compiled
-def sweep(
-    maps: SignalMaps, starts: Array, at: int, pull: Array, push: Array, pushed: bool,
-    feed: Array, cost: Array, states: Array, inputs: Array,
-) -> None:  # fmt: skip
-    """Optimal states and inputs for a linear cost ``pull . x + push . u`` beside the model's own.
-
-    Parameters
-    ----------
-    maps : SignalMaps
-        Model.
-    starts : array, shape (batch, 12)
-        States now.
-    at : int
-        Which of them.
-    pull, push : array, shapes (N, 12) and (N, 4)
-        Linear cost of the state at the end of each stage and of its input.
-    pushed : bool
-        Whether push is anything but zero.
-    feed : array, shape (N, 4)
-        Room to work in.
-    cost : array, shape (N, 12)
-        Where the linear part of the optimal cost from the end of each stage on goes.
-    states, inputs : array, shapes (N, 12) and (N, 4)
-        Where the answer goes.
-    """
-    n = len(feed)
-    for k in range(n):
-        for i in range(STATES):
-            cost[k, i], states[k, i] = pull[k, i], 0.0
-        for m in range(INPUTS):
-            feed[k, m], inputs[k, m] = 0.0, 0.0
-    for k in range(n - 1, -1, -1):
-        add(maps, PULL, k, -1.0, cost, k, feed, k, 0)
-        if pushed:
-            add(maps, INVERSE, k, -1.0, push, k, feed, k, 0)
-        if k == 0:
-            break
-        add_turned(maps, CLOSED, k, 1.0, cost, k, cost, k - 1, 0)
-        if pushed:
-            add_turned(maps, GAIN, k, -1.0, push, k, cost, k - 1, 0)
-    for k in range(n):
-        for m in range(INPUTS):
-            inputs[k, m] = feed[k, m]
-        if k == 0:
-            add(maps, GAIN, k, -1.0, starts, at, inputs, k, 0)
-            add(maps, A, k, 1.0, starts, at, states, k, 0)
-        else:
-            add(maps, GAIN, k, -1.0, states, k - 1, inputs, k, 0)
-            add(maps, A, k, 1.0, states, k - 1, states, k, 0)
-        add(maps, B, k, 1.0, inputs, k, states, k, 0)
-
-
-@compiled
-def read_signals(maps: SignalMaps, states: Array, inputs: Array, signals: Array) -> None:
-    """Write the signals (13 N,) of states (N, 12) and inputs (N, 4)."""
-    for i in range(len(signals)):
-        k, target = maps.stage[i], maps.target[i]
-        signals[i] = states[k, target] if target < STATES else inputs[k, target - STATES]
-
-
-@compiled
-def stationarity(
-    maps: SignalMaps, starts: Array, at: int, states: Array, inputs: Array, cost: Array, linear: Array,
-    force: Array, costates: Array, loads: Array, weighed: Array, carried: Array, out: Array,
-) -> None:  # fmt: skip
-    """Multipliers of the dynamics, and how well states and inputs balance model, cost and forces.
-
-    The multipliers are minus the gradient of the optimal cost from each stage on; the balance is taken of the
-    model's own matrices.
-
-    Parameters
-    ----------
-    maps : SignalMaps
-        Model.
-    starts : array, shape (batch, 12)
-        States now.
-    at : int
-        Which of them.
-    states, inputs : array, shapes (N, 12) and (N, 4)
-        The plan.
-    cost : array, shape (N, 12)
-        From the sweep that made the plan.
-    linear : array, shape (N, 12)
-        -Q ref.
-    force : array, shape (13 N,)
-        Sum of the rows times their multipliers, by signal.
-    costates : array, shape (N, 12)
-        Where the multipliers of the dynamics go.
-    loads, weighed, carried : array, shape (N, 16)
-        Room to work in.
-    out : array, shape (6,)
-        Largest violation of the dynamics and its largest term, largest entry of the Lagrangian's gradient and
-        its largest term, largest multiplier times violation of the dynamics and its largest term.
-    """
-    n = len(states)
-    for k in range(n):
-        for i in range(STATES + INPUTS):
-            loads[k, i], weighed[k, i], carried[k, i] = 0.0, 0.0, 0.0
-        for i in range(STATES):
-            costates[k, i] = -cost[k, i]
-    for i in range(len(force)):
-        loads[maps.stage[i], maps.target[i]] += force[i]
-    for e in range(6):
-        out[e] = 0.0
-    for k in range(n - 1, -1, -1):
-        add(maps, TO_GO, k, -1.0, states, k, costates, k, 0)
-        add(maps, Q, k, 1.0, states, k, weighed, k, 0)
-        if k + 1 < n:
-            add_turned(maps, A, k + 1, 1.0, costates, k + 1, carried, k, 0)
-        add(maps, R, k, 1.0, inputs, k, weighed, k, STATES)
-        add_turned(maps, B, k, 1.0, costates, k, carried, k, STATES)
-        for i in range(STATES):
-            left = weighed[k, i] + linear[k, i] + costates[k, i] - carried[k, i] - loads[k, i]
-            out[2] = max(out[2], abs(left))
-            out[3] = max(out[3], abs(weighed[k, i]), abs(linear[k, i]), abs(costates[k, i]))
-        for m in range(STATES, STATES + INPUTS):
-            out[2] = max(out[2], abs(weighed[k, m] - carried[k, m] - loads[k, m]))
-            out[3] = max(out[3], abs(weighed[k, m]), abs(loads[k, m]))
-    for k in range(n):
-        # The other way round than in the sweep, and in place of what is no longer needed.
-        for i in range(STATES):
-            loads[k, i] = 0.0
-        add(maps, B, k, 1.0, inputs, k, loads, k, 0)
-        if k == 0:
-            add(maps, A, k, 1.0, starts, at, loads, k, 0)
-        else:
-            add(maps, A, k, 1.0, states, k - 1, loads, k, 0)
-        for i in range(STATES):
-            gap = abs(states[k, i] - loads[k, i])
-            out[0] = max(out[0], gap)
-            out[1] = max(out[1], abs(states[k, i]))
-            out[4] = max(out[4], gap * abs(costates[k, i]))
-            out[5] = max(out[5], abs(costates[k, i] * states[k, i]))
