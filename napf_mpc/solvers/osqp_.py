@@ -24,17 +24,20 @@ from napf_mpc.quadratic_program import Array, Index, QpStatus, Sparsity, Values
 from napf_mpc.solvers.solver import Answer, MakeBackend, Warm
 
 DEFAULTS: dict[str, Any] = {
-    "eps_abs": 1e-4,
+    "eps_abs": 3e-4,
     "eps_rel": 0.0,
     "polishing": False,
+    "alpha": 1.4,
     "check_termination": 5,
     "max_iter": 2000,
 }
-ROUND, LONGER = 10, 1.5
+ROUND, LONGER = 20, 2.0
 """Iterations of the first round, and how much longer each further round is than the one before."""
-EQUAL, LOOSE, PUSHING = 10.0, 0.1, 100.0
+EQUAL, LOOSE, PUSHING = 10.0, 0.07, 50.0
 """Weight times compliance of an equality row and of a row that does not push, and what one that pushes gets
 on top. (OSQP itself puts 1000 on top of equality rows.)"""
+SOFTEST = 1e4
+GROW, TEETH = 4.0, 5
 FREE = 1e4
 """Compliance of a variable without a cost of its own."""
 OURS: dict[str, Any] = {"scaling": 0, "verbose": False, "rho": 1.0, "adaptive_rho": 0}
@@ -155,11 +158,12 @@ class OsqpBackend:
         # Without a guess it would start from where the last solve ended, even if that was far out.
         z, y = (np.zeros(places.variables), np.zeros(places.constraints)) if warm is None else warm
         a, lower, upper = np.empty(len(values.a)), np.empty(len(y)), np.empty(len(y))
+        pushing, turn = PUSHING, 0
         length, left, iterations = ROUND, int(self._settings["max_iter"]), 0
         while True:
             e = _weigh(
                 values.a, places.a_rows, places.a_columns, values.lower, values.upper, own, held, d, z, y,
-                a, lower, upper,
+                a, lower, upper, EQUAL, LOOSE, pushing, SOFTEST,
             )  # fmt: skip
             if self._solver is None:
                 self._setup(p, q, a, lower, upper)
@@ -179,7 +183,9 @@ class OsqpBackend:
             unfinished = name in ("OSQP_MAX_ITER_REACHED", "OSQP_SOLVED_INACCURATE")
             if not unfinished or left <= 0:
                 break
-            length = int(LONGER * length)
+            turn += 1
+            length = int(ROUND * LONGER ** (turn // TEETH))
+            pushing = PUSHING * GROW ** (turn % TEETH)
         status = _STATUS.get(name, QpStatus.FAILED)
         message = "" if status is QpStatus.SOLVED else f"osqp: {result.info.status}"
         return Answer(status, z, y, iterations, message)
@@ -203,6 +209,7 @@ class OsqpBackend:
 def _weigh(
     a: Array, a_rows: Index, a_columns: Index, lower: Array, upper: Array, own: Array, held: Array, d: Array,
     z: Array, y: Array, scaled_a: Array, scaled_lower: Array, scaled_upper: Array,
+    equal: float, loose: float, pushing: float, softest: float,
 ) -> Array:  # fmt: skip
     """Roots (m,) of the rows' weights at a guess; writes the rows scaled by them."""
     constraints = len(lower)
@@ -212,14 +219,14 @@ def _weigh(
         compliance[i] += a[k] * a[k] * (own[j] if lower[i] == upper[i] else held[j])
         reach[i] += a[k] * z[j]
     for i in range(constraints):
-        stiff = 1.0 / min(max(compliance[i], 1e-4), 1e4)
+        stiff = 1.0 / min(max(compliance[i], 1e-4), softest)
         if lower[i] == upper[i]:
-            weight = EQUAL * stiff
+            weight = equal * stiff
         else:
-            weight = LOOSE * stiff
+            weight = loose * stiff
             under, over = lower[i] - reach[i], reach[i] - upper[i]
             if weight * under > y[i] or weight * over > -y[i]:
-                weight *= PUSHING
+                weight *= pushing
         e[i] = np.sqrt(weight)
         scaled_lower[i] = max(lower[i] * e[i], -1e30)
         scaled_upper[i] = min(upper[i] * e[i], 1e30)
