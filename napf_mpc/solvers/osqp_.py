@@ -1,12 +1,12 @@
 """OSQP, the reference: kept workspace, warm start, every row weighed by what it has to move.
 
-ADMM converges at the pace of its row weights, and no one of them fits programs whose rows are metres, radians
-and newtons at prices from nothing to 1e5. Three things are done here before OSQP sees a program. Variables are
-measured by their own curvature, ``P_jj ** -1/2``. Rows are measured by their *compliance*, how far a unit
-force on the row moves it while the equality rows (the dynamics) hold: this depends on the model alone and is
-computed once. And rows that the guess finds pushing count :data:`PUSHING` times as much, the more so as their
-multipliers have furthest to go; after each round of iterations the rows are weighed anew. OSQP's own scaling
-and adaptive rho know none of this and stay off.
+ADMM converges at the pace of its row weights, and no one weight fits rows that are metres, radians and
+newtons at prices from nothing to 1e5. Three things are done here before OSQP sees a program. Variables are
+measured by their own curvature, ``P_jj ** -1/2``. Rows are measured by their *compliance*: how far a unit
+force on the row moves it while the equality rows (the dynamics) hold, which depends on the model alone and is
+computed once. And rows that the guess finds pushing weigh more. After each round of iterations all rows are
+weighed anew, as the last round now is the guess. OSQP's own scaling and adaptive rho know none of this and
+stay off, so that nothing but the guess carries over from one program to the next.
 """
 
 from __future__ import annotations
@@ -24,24 +24,31 @@ from napf_mpc.quadratic_program import Array, Index, QpStatus, Sparsity, Values
 from napf_mpc.solvers.solver import Answer, MakeBackend, Warm
 
 DEFAULTS: dict[str, Any] = {
-    "eps_abs": 3e-4,
+    "eps_abs": 1e-5,
     "eps_rel": 0.0,
-    "polishing": False,
+    "polishing": True,
     "alpha": 1.4,
     "check_termination": 5,
-    "max_iter": 2000,
+    "max_iter": 1000,
 }
-ROUND, LONGER = 20, 2.0
-"""Iterations of the first round, and how much longer each further round is than the one before."""
+"""Over-relaxation leaves a stiff row ``alpha - 1`` of its last error: OSQP's own 1.6 is slow here."""
+OURS: dict[str, Any] = {"scaling": 0, "verbose": False, "rho": 1.0, "adaptive_rho": 0}
+"""Settings that are not to choose."""
+COARSE, EXACT = 3e-4, 1e-7
+"""ADMM need only find the active rows, polishing then solves them exactly: a first try stops at a residual of
+COARSE, and iterations go on to the tolerance only if polishing it leaves more than EXACT (scaled)."""
+ROUND, LONGER = 15, 1.5
+"""Iterations of a round, and how much longer those of each cycle are than of the one before."""
 EQUAL, LOOSE, PUSHING = 10.0, 0.07, 50.0
 """Weight times compliance of an equality row and of a row that does not push, and what one that pushes gets
 on top. (OSQP itself puts 1000 on top of equality rows.)"""
-SOFTEST = 1e4
-GROW, TEETH = 4.0, 5
+STEEPER, CYCLE = 4.0, 5
+"""How much more a pushing row gets each round, and rounds until that starts again: a multiplier that has far
+to go needs much, rows that come and go need little."""
 FREE = 1e4
-"""Compliance of a variable without a cost of its own."""
-OURS: dict[str, Any] = {"scaling": 0, "verbose": False, "rho": 1.0, "adaptive_rho": 0}
-"""Settings that are not to choose."""
+"""Largest compliance: that of a variable or row without a cost of its own."""
+STIFF = 1e-4
+"""Smallest compliance of a row."""
 
 _STATUS = {
     "OSQP_SOLVED": QpStatus.SOLVED,
@@ -53,6 +60,7 @@ _STATUS = {
     "OSQP_MAX_ITER_REACHED": QpStatus.MAX_ITERATIONS,
     "OSQP_TIME_LIMIT_REACHED": QpStatus.MAX_ITERATIONS,
 }
+_UNFINISHED = ("OSQP_MAX_ITER_REACHED", "OSQP_SOLVED_INACCURATE")
 
 
 def maker(name: str, **settings: Any) -> MakeBackend:
@@ -147,48 +155,48 @@ class OsqpBackend:
         KeyboardInterrupt
             OSQP takes the interrupt for itself; this hands it on.
         """
-        places = self._sparsity
+        places, settings = self._sparsity, self._settings
         own = np.full(places.variables, FREE)
-        curvature = values.p[self._diagonal]
-        own[places.p_rows[self._diagonal]] = 1.0 / np.maximum(curvature, 1.0 / FREE)
+        own[places.p_rows[self._diagonal]] = 1.0 / np.maximum(values.p[self._diagonal], 1.0 / FREE)
         held = self._compliances.of(places, values, own)
         d = np.sqrt(own)
-        p = values.p[self._upper] * d[self._p_rows] * d[self._p_columns]
-        q = values.q * d
+        p, q = values.p[self._upper] * d[self._p_rows] * d[self._p_columns], values.q * d
         # Without a guess it would start from where the last solve ended, even if that was far out.
         z, y = (np.zeros(places.variables), np.zeros(places.constraints)) if warm is None else warm
-        a, lower, upper = np.empty(len(values.a)), np.empty(len(y)), np.empty(len(y))
-        pushing, turn = PUSHING, 0
-        length, left, iterations = ROUND, int(self._settings["max_iter"]), 0
+        coarse = bool(settings["polishing"]) and settings["eps_abs"] < COARSE
+        most, used, turn = int(settings["max_iter"]), 0, 0
         while True:
-            e = _weigh(
+            e, a, lower, upper = _weighed(
                 values.a, places.a_rows, places.a_columns, values.lower, values.upper, own, held, d, z, y,
-                a, lower, upper, EQUAL, LOOSE, pushing, SOFTEST,
+                PUSHING * STEEPER ** (turn % CYCLE),
             )  # fmt: skip
             if self._solver is None:
                 self._setup(p, q, a, lower, upper)
-            elif iterations:
+            elif turn:
                 self._solver.update(l=lower, u=upper, Ax=a)
             else:
                 self._solver.update(q=q, l=lower, u=upper, Px=p, Ax=a)
-            self._solver.warm_start(x=z / d, y=y / e)
-            self._solver.update_settings(max_iter=min(length, left))
+            self._solver.warm_start(x=z / d, y=np.append(y, 0.0) / e)
+            self._solver.update_settings(
+                max_iter=min(int(ROUND * LONGER ** (turn // CYCLE)), most - used),
+                eps_abs=COARSE if coarse else settings["eps_abs"],
+                eps_rel=0.0 if coarse else settings["eps_rel"],
+            )
             result = self._solver.solve(raise_error=False)
-            iterations += int(result.info.iter)
-            left -= int(result.info.iter)
+            used, turn = used + int(result.info.iter), turn + 1
             name = osqp.SolverStatus(result.info.status_val).name
             if name == "OSQP_SIGINT":
                 raise KeyboardInterrupt
-            z, y = result.x * d, result.y * e
-            unfinished = name in ("OSQP_MAX_ITER_REACHED", "OSQP_SOLVED_INACCURATE")
-            if not unfinished or left <= 0:
+            z, y = result.x * d, (result.y * e)[: places.constraints]
+            if used >= most or name not in (*_UNFINISHED, "OSQP_SOLVED"):
                 break
-            turn += 1
-            length = int(ROUND * LONGER ** (turn // TEETH))
-            pushing = PUSHING * GROW ** (turn % TEETH)
+            if name == "OSQP_SOLVED":
+                if not coarse or max(result.info.prim_res, result.info.dual_res) <= EXACT:
+                    break
+                coarse = False
         status = _STATUS.get(name, QpStatus.FAILED)
         message = "" if status is QpStatus.SOLVED else f"osqp: {result.info.status}"
-        return Answer(status, z, y, iterations, message)
+        return Answer(status, z, y, used, message)
 
     def _setup(self, p: Array, q: Array, a: Array, lower: Array, upper: Array) -> None:
         places, n = self._sparsity, self._sparsity.variables
@@ -206,30 +214,31 @@ class OsqpBackend:
 
 
 @compiled
-def _weigh(
+def _weighed(
     a: Array, a_rows: Index, a_columns: Index, lower: Array, upper: Array, own: Array, held: Array, d: Array,
-    z: Array, y: Array, scaled_a: Array, scaled_lower: Array, scaled_upper: Array,
-    equal: float, loose: float, pushing: float, softest: float,
-) -> Array:  # fmt: skip
-    """Roots (m,) of the rows' weights at a guess; writes the rows scaled by them."""
-    constraints = len(lower)
-    e, compliance, reach = np.empty(constraints), np.zeros(constraints), np.zeros(constraints)
+    z: Array, y: Array, pushing: float,
+) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+    """Roots (m + 1,) of the rows' weights at a guess, and the rows scaled by them: entries and bounds.
+
+    The last row is an empty one, 0 = 0: without any active row OSQP does not polish, and prints so.
+    """
+    m = len(lower)
+    e, scaled, low, high = np.ones(m + 1), np.empty(len(a)), np.zeros(m + 1), np.zeros(m + 1)
+    compliance, reach = np.zeros(m), np.zeros(m)
     for k in range(len(a)):
         i, j = a_rows[k], a_columns[k]
         compliance[i] += a[k] * a[k] * (own[j] if lower[i] == upper[i] else held[j])
         reach[i] += a[k] * z[j]
-    for i in range(constraints):
-        stiff = 1.0 / min(max(compliance[i], 1e-4), softest)
+    for i in range(m):
+        stiffness = 1.0 / min(max(compliance[i], STIFF), FREE)
         if lower[i] == upper[i]:
-            weight = equal * stiff
+            weight = EQUAL * stiffness
         else:
-            weight = loose * stiff
-            under, over = lower[i] - reach[i], reach[i] - upper[i]
-            if weight * under > y[i] or weight * over > -y[i]:
+            weight = LOOSE * stiffness
+            if weight * (lower[i] - reach[i]) > y[i] or weight * (reach[i] - upper[i]) > -y[i]:
                 weight *= pushing
         e[i] = np.sqrt(weight)
-        scaled_lower[i] = max(lower[i] * e[i], -1e30)
-        scaled_upper[i] = min(upper[i] * e[i], 1e30)
+        low[i], high[i] = lower[i] * e[i], upper[i] * e[i]
     for k in range(len(a)):
-        scaled_a[k] = a[k] * e[a_rows[k]] * d[a_columns[k]]
-    return e
+        scaled[k] = a[k] * e[a_rows[k]] * d[a_columns[k]]
+    return e, scaled, low, high
