@@ -50,7 +50,13 @@ PERIOD_S = 0.05
 """A step that takes longer has missed it."""
 GROUP = 10
 """Steps one after the other that other controllers are shown."""
-WAYS = ("kernel", "osqp", "osqp, setup each step")
+WAYS: dict[str, dict[str, object]] = {
+    "kernel": {},
+    "osqp": {},
+    "osqp, not polished": {"polishing": False},
+    "osqp, setup each step": {},
+}
+"""Ways by name, which begins with the solver's, and the solver's settings."""
 
 
 @dataclass
@@ -138,7 +144,7 @@ class OwnWay:
     def __init__(self, name: str, problem: Problem) -> None:
         self.way = Way(name, problem.uav_count)
         self._rows, self._solve = Stopwatch(), Stopwatch()
-        solver = make_batch_solver(name.partition(",")[0])
+        solver = make_batch_solver(name.partition(",")[0], **WAYS[name])
         self.planner = QpPlanner(problem, solver=TimedSolver(solver, self._solve, "setup" in name))
         self.planner.constraints = [TimedRows(rows, self._rows) for rows in self.planner.constraints]
 
@@ -305,6 +311,7 @@ def main() -> int:
         "--others-every", type=int, default=10, help="steps between those of the others, 0: none"
     )
     parser.add_argument("--seed", type=int, default=7501)
+    parser.add_argument("--no-single", action="store_true", help="leave the scenes of one UAV out")
     arguments = parser.parse_args()
     if arguments.steps < 100 or arguments.others_every < 0:
         parser.error("steps must be 100 or more, others-every 0 or more")
@@ -323,7 +330,8 @@ def main() -> int:
     with threadpool_limits(1):
         for name in arguments.problem:
             problem = load_problem(name, {"navigation.filter": "kalman", "planner.kind": "qp"})
-            for scene, flown in ((name, problem), (f"{name}, one UAV", alone(problem))):
+            single = [] if arguments.no_single else [(f"{name}, one UAV", alone(problem))]
+            for scene, flown in [(name, problem), *single]:
                 every = arguments.others_every
                 others = others_installed(flown) if every and flown is problem else []
                 fly(flown, Bench(flown, arguments.ways, [], 1), 3, arguments.seed)  # compile what is compiled

@@ -229,9 +229,20 @@ def test_batch_is_one_by_one_bit_for_bit(name: str) -> None:
         warm = whole.warm_start(whole.states, whole.inputs)
 
 
+class Remembering:
+    """A back-end whose answers show how many programs it has seen."""
+
+    def __init__(self, sparsity: Sparsity) -> None:
+        self._sparsity, self._seen = sparsity, 0
+
+    def solve(self, values: Values, warm: Warm | None) -> Answer:
+        self._seen += 1
+        z, y = np.full(self._sparsity.variables, float(self._seen)), np.zeros(self._sparsity.constraints)
+        return Answer(QpStatus.SOLVED, z, y, self._seen)
+
+
 def test_workspace_history_is_forgotten_by_reset() -> None:
-    # Unpolished answers show in their last digits how they were reached.
-    fresh, used, kept = (make_batch_solver("osqp", polishing=False) for _ in range(3))
+    fresh, used, kept = (PerUavSolver(Remembering) for _ in range(3))
     for seed in (7, 8, 9):
         used.solve_batch(flight(2, 2, seed))
         kept.solve_batch(flight(2, 2, seed))
@@ -241,6 +252,21 @@ def test_workspace_history_is_forgotten_by_reset() -> None:
     fresh.reset()
     for mine, theirs in zip(bits(used.solve_batch(horizon)), bits(fresh.solve_batch(horizon)), strict=True):
         np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize("polishing", [True, False])
+def test_osqp_answers_depend_on_the_program_alone(polishing: bool) -> None:
+    # Unpolished answers would show in their last digits how they were reached.
+    fresh, used, kept = (make_batch_solver("osqp", polishing=polishing) for _ in range(3))
+    for seed in (7, 8, 9):
+        used.solve_batch(flight(2, 2, seed))
+        kept.solve_batch(flight(2, 2, seed))
+    used.reset()
+    horizon = flight(2, 2, 10)
+    expected = bits(fresh.solve_batch(horizon))
+    for solver in (used, kept):
+        for mine, theirs in zip(bits(solver.solve_batch(horizon)), expected, strict=True):
+            np.testing.assert_array_equal(mine, theirs)
 
 
 def test_masked_runs_are_skipped_whatever_they_hold() -> None:
