@@ -69,6 +69,7 @@ class Search(NamedTuple):
     wide: Lattice  # coarser and farther to the sides, for large margins
     wide_m: float  # radius and margin from which that is used
     prices: Prices
+    wide_prices: Prices  # of the coarser lattice
     k: float
     radius_m: float
     passes: int
@@ -252,6 +253,7 @@ def plan_run(
     for i in range(uavs):
         if largest_reach(covariance[i], search.k, need) > search.wide_m:
             lattice = search.wide
+            prices = search.wide_prices
     step = lattice.step_m / lattice.fine
     span = lattice.half * lattice.cell_m
     ahead = (lattice.stations - 1) * lattice.step_m

@@ -35,7 +35,7 @@ class GuidanceSettings:
     """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
     path: float = 3.0
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
-    shape: float = 8.0
+    shape: float = 7.0
     """Price of a squared difference to the mean of all offsets [1/m^2 per metre]."""
     far_m: float = 5.0
     """Offsets beyond this are priced linearly [m]."""
@@ -113,29 +113,35 @@ def _lattice(settings: GuidanceSettings, scale: int) -> Lattice:
     )
 
 
+def _prices(settings: GuidanceSettings, scale: int) -> Prices:
+    """Prices with all lengths a number of times as long: the same shapes, only larger."""
+    return Prices(
+        settings.path,
+        settings.shape,
+        settings.far_m * scale,
+        settings.slope * scale**2,
+        settings.steep,
+        settings.bend * scale**4,
+        settings.keep,
+        settings.keep_m,
+        settings.spare,
+        settings.breach,
+        settings.spare_m,
+        settings.tolerance_m,
+        settings.aside,
+        settings.start,
+        settings.apart,
+    )
+
+
 def search_of(settings: GuidanceSettings, k: float, radius_m: float) -> Search:
     """Settings in the form that the compiled search reads, for a margin of k sigma and a radius [m]."""
     return Search(
         _lattice(settings, 1),
         _lattice(settings, 2),
         settings.wide_m,
-        Prices(
-            settings.path,
-            settings.shape,
-            settings.far_m,
-            settings.slope,
-            settings.steep,
-            settings.bend,
-            settings.keep,
-            settings.keep_m,
-            settings.spare,
-            settings.breach,
-            settings.spare_m,
-            settings.tolerance_m,
-            settings.aside,
-            settings.start,
-            settings.apart,
-        ),
+        _prices(settings, 1),
+        _prices(settings, 2),
         k,
         radius_m,
         settings.passes,
