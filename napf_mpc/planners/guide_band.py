@@ -176,14 +176,23 @@ def add_row(own: Array, right: Array, s: int, weight: float, g0: float, g1: floa
 
 
 @compiled
-def add_solids(
-    sight: Sight, i: int, step_m: float, weight: float, draft: Array, profile: Array, band: Band
+def take_solids(
+    sight: Sight,
+    i: int,
+    step_m: float,
+    weight: float,
+    draft: Array,
+    profile: Array,
+    band: Band,
+    missing: Array,
 ) -> None:
-    """Add the linearised shortfalls of a profile to its band system.
+    """Largest shortfall (station,) along a profile, 0 where nothing is short, in place.
 
-    Where the distance grows along the path only, as before a wall, its gradient does not tell which way to
-    give: there the profile is drawn to its draft.
+    With a positive weight, linearised shortfalls are added to the profile's band system too. Where the
+    distance grows along the path only, as before a wall, its gradient does not tell which way to give: there
+    the profile is drawn to its draft.
     """
+    missing[:] = 0.0
     own, right = band.own, band.right
     near, found = sight.near, sight.found
     solids, frame, turned, covariance = sight.solids, sight.frame, sight.turned[i], sight.covariance[i]
@@ -223,10 +232,13 @@ def add_solids(
                 short, g0, g1 = shortfall(
                     solids, found[i, entry], frame, along, left, up, covariance, k, need
                 )  # fmt: skip
-            if short > 0.0 and g0 * g0 + g1 * g1 < LEAST_ACROSS**2:
+            missing[s] = max(missing[s], short)
+            if weight <= 0.0 or short <= 0.0:
+                continue
+            if g0 * g0 + g1 * g1 < LEAST_ACROSS**2:
                 add_row(own, right, s, weight * step_m, 1.0, 0.0, draft[s, 0])
                 add_row(own, right, s, weight * step_m, 0.0, 1.0, draft[s, 1])
-            elif short > 0.0:
+            else:
                 wanted = short + g0 * profile[s, 0] + g1 * profile[s, 1]
                 add_row(own, right, s, weight * step_m, g0, g1, wanted)
 
@@ -260,51 +272,6 @@ def add_neighbour(
         target = math.sqrt(max(separation * separation - along * along, 0.0)) - across
         wanted = 0.5 * target + g0 * profile[s, 0] + g1 * profile[s, 1]
         add_row(own, right, s, weight * step_m, g0, g1, wanted)
-
-
-@compiled
-def exact_missing(sight: Sight, i: int, step_m: float, profile: Array, missing: Array) -> None:
-    """Largest shortfall (station,) along a profile, 0 where nothing is short, in place."""
-    missing[:] = 0.0
-    near, found = sight.near, sight.found
-    solids, frame, turned, covariance = sight.solids, sight.frame, sight.turned[i], sight.covariance[i]
-    k, need = sight.k, sight.need_m
-    lane, height, start = sight.lanes[i, 0], sight.lanes[i, 1], sight.along[i]
-    stations = profile.shape[0]
-    lowest = highest = profile[0, 0]
-    for s in range(1, stations):
-        lowest = min(lowest, profile[s, 0])
-        highest = max(highest, profile[s, 0])
-    lowest += lane
-    highest += lane
-    for entry in range(sight.solid_count[i]):
-        if lowest > near[i, entry, HIGH + 1] or highest < near[i, entry, LOW + 1]:
-            continue
-        s0 = max(0, int(np.ceil((near[i, entry, LOW] - start) / step_m)))
-        s1 = min(stations - 1, int(np.floor((near[i, entry, HIGH] - start) / step_m)))
-        ball = near[i, entry, ROUND]
-        for s in range(s0, s1 + 1):
-            along = start + s * step_m
-            left = lane + profile[s, 0]
-            up = height + profile[s, 1]
-            if left < near[i, entry, LOW + 1] or left > near[i, entry, HIGH + 1]:
-                continue
-            if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
-                continue
-            x = along - near[i, entry, ALONG]
-            y = left - near[i, entry, LEFT]
-            z = ball * (up - near[i, entry, UP])
-            if ball >= 0.0 and x * x + y * y + z * z > near[i, entry, OUTER2]:
-                continue
-            if is_round(near, i, entry, up):
-                short = round_shortfall(
-                    x, y, z, near[i, entry, RADIUS], near[i, entry, TOUCHED], turned, k, need
-                )[0]
-            else:
-                short = shortfall(
-                    solids, found[i, entry], frame, along, left, up, covariance, k, need
-                )[0]  # fmt: skip
-            missing[s] = max(missing[s], short)
 
 
 @compiled

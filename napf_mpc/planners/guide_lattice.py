@@ -271,25 +271,24 @@ def _fill_round(
 def any_short(sight: Sight, i: int, lattice: Lattice, below: int, layers: int) -> bool:
     """Whether anything is short for UAV i anywhere on the lattice."""
     cells = 2 * lattice.half + 1
-    # What is short anywhere is so next to the middle of a solid, most times.
     near = sight.near
-    for entry in range(sight.solid_count[i]):
-        along = 0.5 * (near[i, entry, LOW] + near[i, entry, HIGH]) - sight.along[i]
-        left = 0.5 * (near[i, entry, LOW + 1] + near[i, entry, HIGH + 1]) - sight.lanes[i, 0]
-        s = round(along / lattice.step_m)
-        c = round(left / lattice.cell_m) + lattice.half
-        s = min(max(s, 0), lattice.stations - 1)
-        c = min(max(c, 0), cells - 1)
-        for v in range(layers):
-            cover(sight, i, lattice, below, s, v, v, c, c)
-            if sight.missing[i, s, v, c] > 0.0:
-                return True
-    for s in range(lattice.stations):
+    count = sight.solid_count[i]
+    # What is short anywhere is so next to the middle of a solid, most times: there first.
+    for n in range(count + lattice.stations):
+        s = n - count
+        low = 0
+        high = cells - 1
+        if n < count:
+            along = 0.5 * (near[i, n, LOW] + near[i, n, HIGH]) - sight.along[i]
+            left = 0.5 * (near[i, n, LOW + 1] + near[i, n, HIGH + 1]) - sight.lanes[i, 0]
+            s = min(max(round(along / lattice.step_m), 0), lattice.stations - 1)
+            low = min(max(round(left / lattice.cell_m) + lattice.half, 0), cells - 1)
+            high = low
         if sight.here_count[i, s] == 0:
             continue
         for v in range(layers):
-            cover(sight, i, lattice, below, s, v, v, 0, cells - 1)
-            for c in range(cells):
+            cover(sight, i, lattice, below, s, v, v, low, high)
+            for c in range(low, high + 1):
                 if sight.missing[i, s, v, c] > 0.0:
                     return True
     return False
@@ -609,39 +608,32 @@ def search_within(
     cells = 2 * lattice.half + 1
     weight = float(query.stop - query.first)
     value = bench.value
+    window = (start_layer, start_layer, start_cell, start_cell)
     if query.aside >= 0.0:
         window = (lowest, highest, 0, cells - 1)
-    else:
-        window = (start_layer, start_layer, start_cell, start_cell)
-    _clear(value, 0, window)
-    for v in range(window[0], window[1] + 1):
-        for c in range(window[2], window[3] + 1):
-            value[0, LAYER_HALO + v, HALO + c] = 0.0
-    window = _pay(sight, lattice, below, prices, query, bench, 0, window, weight, np.inf)
-    if query.aside >= 0.0:
-        aside = weight * query.aside
-        _spread(
-            value[0],
-            lowest,
-            highest,
-            cells,
-            start_cell,
-            start_layer,
-            aside * lattice.cell_m,
-            aside * lattice.layer_m,
-        )
-    for s in range(1, lattice.stations):
-        if window[1] < window[0]:
-            return np.inf
-        window = (
-            max(lowest, window[0] - 1), min(highest, window[1] + 1),
-            max(0, window[2] - 2), min(cells - 1, window[3] + 2),
-        )  # fmt: skip
+    for s in range(lattice.stations):
+        if s > 0:
+            window = (
+                max(lowest, window[0] - 1), min(highest, window[1] + 1),
+                max(0, window[2] - 2), min(cells - 1, window[3] + 2),
+            )  # fmt: skip
         _clear(value, s, window)
         least = weight * (lattice.step_m * prices.path + bench.ahead[s])
         for v in range(window[0], window[1] + 1):
-            _relax(value, bench.bend, s, v, window[2], window[3], edge, least, limit)
-        window = _pay(sight, lattice, below, prices, query, bench, s, window, weight, limit)
+            if s > 0:
+                _relax(value, bench.bend, s, v, window[2], window[3], edge, least, limit)
+            else:
+                value[0, LAYER_HALO + v, HALO + window[2] : HALO + window[3] + 1] = 0.0
+        window = _pay(
+            sight, lattice, below, prices, query, bench, s, window, weight, limit if s > 0 else np.inf
+        )
+        if s == 0 and query.aside >= 0.0:
+            _spread(
+                value[0], lowest, highest, cells, start_cell, start_layer,
+                weight * query.aside * lattice.cell_m, weight * query.aside * lattice.layer_m,
+            )  # fmt: skip
+        if window[1] < window[0]:
+            return np.inf
     best = np.inf
     c_end = start_cell
     v_end = start_layer
@@ -720,19 +712,20 @@ def cheapest_profile(
     known = price_of(sight, lattice, below, layers, prices, query, bench.bend, edge, c, v, wanted)
     # Sums are rounded: a little above the price of a profile that is there.
     known += 1e-9 * known + 1e-9
-    if layers > 1 and v == below and known > FIRST_GUESS * weight:
-        level = search_within(
-            sight, lattice, below, below, below, prices, query, bench, edge, c, v, known, profile
-        )
-        known = min(known, level + 1e-9 * level)
-    limit = FIRST_GUESS * weight if layers > 1 else known
-    while limit < 0.5 * known:
+    guess = FIRST_GUESS * weight
+    limit = guess if layers > 1 else known
+    # On the lane's own layer first, if that may lower the bound: it has few places.
+    level = layers > 1 and v == below and known > guess
+    while True:
+        final = not level and not limit < 0.5 * known
         price = search_within(
-            sight, lattice, below, 0, layers - 1, prices, query, bench, edge, c, v, limit, profile
-        )
-        if price < np.inf:
+            sight, lattice, below, below if level else 0, below if level else layers - 1, prices, query,
+            bench, edge, c, v, known if level or final else limit, profile,
+        )  # fmt: skip
+        if level:
+            level = False
+            known = min(known, price + 1e-9 * price)
+        elif final or price < np.inf:
             return price
-        limit *= 4.0
-    return search_within(
-        sight, lattice, below, 0, layers - 1, prices, query, bench, edge, c, v, known, profile
-    )
+        else:
+            limit *= 4.0

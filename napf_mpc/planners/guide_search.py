@@ -18,11 +18,10 @@ from napf_mpc.planners.guide_band import (
     Band,
     add_neighbour,
     add_row,
-    add_solids,
     band_price,
-    exact_missing,
     smooth_terms,
     solve_band,
+    take_solids,
 )
 from napf_mpc.planners.guide_clearance import (
     COLUMNS,
@@ -314,37 +313,44 @@ def plan_run(
     mean_profile(last, mean)
     draft_mean = np.empty((fine, 2))
     start = offset.copy()
+    middle = np.zeros(2)
+    for i in range(uavs):
+        middle += offset[i] / uavs
     best = np.inf
     trial = np.empty((uavs, fine, 2))
     drafts = np.empty((uavs, fine, 2))
     trial_missing = np.empty((uavs, fine))
     for draft in range(2):
         draft_mean[:] = mean
-        if draft == 1:
-            if in_the_way < 2 or missing.max() <= prices.spare_m:
-                # One way for all never was cheaper where each had found its own.
-                break
-            middle = np.zeros(2)
-            for i in range(uavs):
-                middle += offset[i] / uavs
-            query = Query(0, uavs, 0.0, mean, last, coarse, separation, False, aside)
-            cheapest_profile(sight, lattice, below, layers, prices, query, bench, middle, coarse[0])
-            _refine(coarse[0], lattice.fine, draft_mean)
-        for i in range(uavs):
-            if away[i]:
-                crowded = False
-                for j in range(i):
-                    crowded = crowded or abs(along[i] - along[j]) < separation[i, j]
-                query = Query(i, i + 1, prices.shape, draft_mean, last, coarse, separation, crowded, aside)
-                cheapest_profile(sight, lattice, below, layers, prices, query, bench, offset[i], coarse[i])
-                _refine(coarse[i], lattice.fine, trial[i])
-                for a in range(2):
-                    start[i, a] = offset[i, a]
-                    if stuck and abs(coarse[i, 0, a] - offset[i, a]) > lattice.cell_m:
-                        start[i, a] = coarse[i, 0, a]
-            else:
+        if draft == 1 and (in_the_way < 2 or missing.max() <= prices.spare_m):
+            # One way for all never was cheaper where each had found its own.
+            break
+        # In the second draft the way for all comes first, and draws the others.
+        for i in range(-draft, uavs):
+            shared = i < 0
+            if not shared and not away[i]:
                 coarse[i] = 0.0
                 trial[i] = 0.0
+                continue
+            crowded = False
+            for j in range(i):
+                crowded = crowded or abs(along[i] - along[j]) < separation[i, j]
+            query = Query(
+                0 if shared else i, uavs if shared else i + 1, 0.0 if shared else prices.shape, draft_mean,
+                last, coarse, separation, crowded, aside,
+            )  # fmt: skip
+            chosen = coarse[max(i, 0)]
+            cheapest_profile(
+                sight, lattice, below, layers, prices, query, bench, middle if shared else offset[i], chosen
+            )
+            if shared:
+                _refine(chosen, lattice.fine, draft_mean)
+                continue
+            _refine(chosen, lattice.fine, trial[i])
+            for a in range(2):
+                start[i, a] = offset[i, a]
+                if stuck and abs(chosen[0, a] - offset[i, a]) > lattice.cell_m:
+                    start[i, a] = chosen[0, a]
         drafts[:] = trial
         for _ in range(search.passes):
             mean_profile(trial, draft_mean)
@@ -354,7 +360,7 @@ def plan_run(
                     add_row(band.own, band.right, 0, prices.start, 1.0, 0.0, start[i, 0])
                     add_row(band.own, band.right, 0, prices.start, 0.0, 1.0, start[i, 1])
                 if is_short[i]:
-                    add_solids(sight, i, step, PUSH, drafts[i], trial[i], band)
+                    take_solids(sight, i, step, PUSH, drafts[i], trial[i], band, trial_missing[i])
                 for j in range(uavs):
                     if j != i and abs(along[i] - along[j]) < separation[i, j]:
                         add_neighbour(
@@ -368,7 +374,7 @@ def plan_run(
                         change = band.right[s, a] - trial[i, s, a]
                         trial[i, s, a] += min(max(change, -search.pass_m), search.pass_m)
         for i in range(uavs):
-            exact_missing(sight, i, step, trial[i], trial_missing[i])
+            take_solids(sight, i, step, 0.0, drafts[i], trial[i], band, trial_missing[i])
         mean_profile(trial, draft_mean)
         price = band_price(trial, draft_mean, last, trial_missing, step, prices)
         if draft == 0 or price < search.shared_gain * best:
