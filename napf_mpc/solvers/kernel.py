@@ -19,8 +19,8 @@ from napf_mpc.solvers.kernel_rows import RowPlaces, RowTable, gather
 from napf_mpc.solvers.kernel_signals import SignalMaps, signal_maps
 from napf_mpc.solvers.kernel_sweep import Lanes
 
-CHUNK = 32
-"""Programs whose rows are gathered together: few enough to stay in the cache."""
+CHUNK = 16
+"""Programs solved side by side: enough to share the model's entries, few enough to stay in the cache."""
 _STATUS = {
     OPTIMAL: QpStatus.SOLVED,
     INFEASIBLE: QpStatus.PRIMAL_INFEASIBLE,
