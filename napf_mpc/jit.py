@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -20,9 +20,11 @@ def compiled(function: F) -> F:
 
 
 def compiled_bare(function: F) -> F:
-    """The same without reference counts, for what allocates nothing and is called from compiled code alone.
+    """The same without reference counts, for functions that allocate nothing.
 
     A count for every array of every call costs more than the few sums of a small function. What such a
-    function calls must be compiled so as well.
+    function calls is compiled so as well.
     """
-    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function))
+    # Not among the options that numba's types know.
+    bare: dict[str, Any] = {"_nrt": False}
+    return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", **bare)(function))

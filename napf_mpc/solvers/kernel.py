@@ -1,8 +1,9 @@
 """The kernel solver: exact answers for the horizons of many UAVs, by a dual active set on the signal kernel.
 
-What the model determines is computed once for a model; a program costs two sweeps along its stages, a scan of
-its rows for each change of the working set, and a certificate. See :mod:`~napf_mpc.solvers.kernel_signals`
-and :mod:`~napf_mpc.solvers.kernel_active_set`.
+What the model determines is computed once for a model; a program costs two sweeps along its stages, made side
+by side with others', a scan of its rows where no known row is violated, and a certificate. See
+:mod:`~napf_mpc.solvers.kernel_signals`, :mod:`~napf_mpc.solvers.kernel_sweep` and
+:mod:`~napf_mpc.solvers.kernel_active_set`.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from napf_mpc.solvers.kernel_rows import RowPlaces, RowTable, gather
 from napf_mpc.solvers.kernel_signals import SignalMaps, signal_maps
 from napf_mpc.solvers.kernel_sweep import Lanes
 
-CHUNK = 32
-"""Programs whose rows are gathered together: few enough to stay in the cache."""
+CHUNK = 16
+"""Programs solved side by side: enough to share the model's entries, few enough to stay in the cache."""
 _STATUS = {
     OPTIMAL: QpStatus.SOLVED,
     INFEASIBLE: QpStatus.PRIMAL_INFEASIBLE,

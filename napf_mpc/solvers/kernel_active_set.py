@@ -107,14 +107,14 @@ class WorkingSet(NamedTuple):
         rows, groups = families * stages, shelves * stages
         n = capacity(stages, rows, soft)
         shelf = np.zeros((shelves, stages))
-        floats, wholes = [np.zeros(n) for _ in range(4)], [np.zeros(n, dtype=np.int64) for _ in range(3)]
-        prices = [np.zeros(groups) for _ in range(4)]
+        whole = np.int64
         return cls(
-            wholes[0], floats[0], wholes[1], *floats[1:],
-            np.zeros((n, (STATES + 1) * stages)), np.zeros((n, n)), np.zeros((n, n)), wholes[2],
-            np.zeros(rows, dtype=np.uint8), np.zeros(groups, dtype=np.bool_), shelf.reshape(groups), shelf,
-            *prices, np.zeros(groups, dtype=np.int64), np.zeros(5, dtype=np.int64),
-            np.zeros(rows, dtype=np.int64), np.zeros((families, stages)), np.zeros((families, stages)),
+            np.zeros(n, whole), np.zeros(n), np.zeros(n, whole), np.zeros(n), np.zeros(n), np.zeros(n),
+            np.zeros((n, (STATES + 1) * stages)), np.zeros((n, n)), np.zeros((n, n)), np.zeros(n, whole),
+            np.zeros(rows, np.uint8), np.zeros(groups, np.bool_), shelf.reshape(groups), shelf,
+            np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(groups), np.zeros(groups, whole),
+            np.zeros(5, whole), np.zeros(rows, whole), np.zeros((families, stages)),
+            np.zeros((families, stages)),
         )  # fmt: skip
 
 
@@ -209,29 +209,35 @@ def widen(work: WorkingSet, first: int, n: int, extra: Array) -> None:
 @compiled_bare
 def factorise(program: Program, work: WorkingSet, first: int, n: int) -> int:
     """Factor anew from a member on; return the first member that depends on those before, or n."""
-    for i in range(first, n):
+    for i in range(max(first, 0), n):
         a, mine = work.slot[i], program.places.group[work.row[i]]
         for j in range(i, n):
-            work.factor[i, j] = work.gram[a, work.slot[j]] + bond(
-                work, mine, program.places.group[work.row[j]]
+            work.factor[i, j] = work.gram[a, work.slot[j]]
+        if work.is_open[mine]:
+            for j in range(i, n):
+                work.factor[i, j] += bond(work, mine, program.places.group[work.row[j]])
+        whole = work.factor[i, i]
+        # Four rows at a time: most are short.
+        for k in range(0, i - 3, 4):
+            one, two, three, four = (
+                work.factor[k, i],
+                work.factor[k + 1, i],
+                work.factor[k + 2, i],
+                work.factor[k + 3, i],
             )
-    for k in range(first):
-        for i in range(first, n):
+            for j in range(i, n):
+                known = one * work.factor[k, j] + two * work.factor[k + 1, j]
+                known += three * work.factor[k + 2, j] + four * work.factor[k + 3, j]
+                work.factor[i, j] -= known
+        for k in range(i - i % 4, i):
             known = work.factor[k, i]
             for j in range(i, n):
                 work.factor[i, j] -= known * work.factor[k, j]
-    for i in range(first, n):
-        a, mine = work.slot[i], program.places.group[work.row[i]]
-        whole = work.gram[a, a] + bond(work, mine, mine)
         if not work.factor[i, i] > DEPENDENT * whole:
             return i
         root = np.sqrt(work.factor[i, i])
         for j in range(i, n):
             work.factor[i, j] /= root
-        for k in range(i + 1, n):
-            known = work.factor[i, k]
-            for j in range(k, n):
-                work.factor[k, j] -= known * work.factor[i, j]
     return n
 
 

@@ -105,8 +105,8 @@ class Kept(NamedTuple):
     """(program,) how each ended so far, or :data:`ALONE`."""
     steps: Index
     """(program,)."""
-    count: Index
-    """(program,) members."""
+    members: Index
+    """(program,) how many."""
     row: Index
     """(program, capacity)."""
     side: Array
@@ -123,10 +123,11 @@ class Kept(NamedTuple):
     @classmethod
     def empty(cls, programs: int, soft: int, members: int) -> Kept:
         """Room for so many programs."""
-        wholes = [np.zeros(programs, dtype=np.int64) for _ in range(3)]
+        shape = (programs, members)
         return cls(
-            *wholes, np.zeros((programs, members), dtype=np.int64), np.zeros((programs, members)),
-            np.zeros((programs, members)), np.zeros((programs, soft)), np.zeros((programs, soft)),
+            np.zeros(programs, dtype=np.int64), np.zeros(programs, dtype=np.int64),
+            np.zeros(programs, dtype=np.int64), np.zeros(shape, dtype=np.int64), np.zeros(shape),
+            np.zeros(shape), np.zeros((programs, soft)), np.zeros((programs, soft)),
             np.zeros((programs, soft), dtype=np.bool_),
         )  # fmt: skip
 
@@ -336,7 +337,8 @@ def certify(
     for f in range(len(program.places.wide)):
         look(program, work, f, room.exact_plane)
         for k in range(n):
-            missed, size = max(missed, work.miss[f, k]), max(size, abs(work.value[f, k]))
+            miss, value = work.miss[f, k], abs(work.value[f, k])
+            missed, size = miss if miss > missed else missed, value if value > size else size
     out[0], out[1] = missed, size
     largest = out[5]
     for j in range(work.counter[WORKING]):
@@ -418,7 +420,7 @@ def begin(
 @compiled_bare
 def keep(work: WorkingSet, kept: Kept, u: int) -> None:
     """Note a program's working set."""
-    kept.count[u], kept.steps[u] = work.counter[WORKING], work.counter[STEPS]
+    kept.members[u], kept.steps[u] = work.counter[WORKING], work.counter[STEPS]
     for j in range(work.counter[WORKING]):
         kept.row[u, j], kept.side[u, j], kept.mult[u, j] = work.row[j], work.side[j], work.mult[j]
     for g in range(kept.slack.shape[1]):
@@ -430,8 +432,8 @@ def keep(work: WorkingSet, kept: Kept, u: int) -> None:
 @compiled_bare
 def recall(work: WorkingSet, kept: Kept, u: int) -> None:
     """Take up a program's working set again, as far as its certificate needs it."""
-    work.counter[WORKING], work.counter[STEPS] = kept.count[u], kept.steps[u]
-    for j in range(kept.count[u]):
+    work.counter[WORKING], work.counter[STEPS] = kept.members[u], kept.steps[u]
+    for j in range(kept.members[u]):
         work.row[j], work.side[j], work.mult[j] = kept.row[u, j], kept.side[u, j], kept.mult[u, j]
     for g in range(kept.slack.shape[1]):
         work.slack[g], work.total[g] = kept.slack[u, g], kept.total[u, g]

@@ -154,15 +154,18 @@ def gather(
     has_lower, has_upper, per_stage = lower.size > 0, upper.size > 0, w1.shape[3]
     for u in range(len(programs)):
         run, uav, faults = programs[u] // uavs, programs[u] % uavs, 0
-        for j in range(count):
-            f = max(family, 0) + j
-            for d in range(dim):
-                for k in range(stages):
+        # In the order of memory: what is read comes from afar, what is written stays near.
+        for k in range(stages):
+            for j in range(count):
+                f = max(family, 0) + j
+                for d in range(dim):
                     coefficient = jac[run, uav, k, j, d]
                     # NaN fails every comparison.
                     faults += not abs(coefficient) < np.inf
                     table.plane[u, d, f, k] = coefficient
-            for k in range(stages):
+        for k in range(stages):
+            for j in range(count):
+                f = max(family, 0) + j
                 low = lower[run, uav, k, j] if has_lower else -np.inf
                 high = upper[run, uav, k, j] if has_upper else np.inf
                 faults += not (low < np.inf and high > -np.inf and (per_stage > 0 or low <= high))

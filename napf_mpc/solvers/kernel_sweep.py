@@ -51,13 +51,13 @@ class Lanes(NamedTuple):
     @classmethod
     def empty(cls, stages: int, count: int) -> Lanes:
         """Room for so many programs."""
-        sizes = {
-            "start": (1, STATES), "loads": (stages, STATES + INPUTS), "feed": (stages, INPUTS),
-            "push": (stages, INPUTS), "inputs": (stages, INPUTS), "weighed": (stages, STATES + INPUTS),
-            "carried": (stages, STATES + INPUTS),
-        }  # fmt: skip
-        large = [np.zeros((*sizes.get(name, (stages, STATES)), count)) for name in cls._fields[:-2]]
-        return cls(*large, np.zeros(count, dtype=np.int64), np.zeros((6, count)))
+        state, push = (stages, STATES, count), (stages, INPUTS, count)
+        both = (stages, STATES + INPUTS, count)
+        return cls(
+            np.zeros((1, STATES, count)), np.zeros(state), np.zeros(state), np.zeros(both), np.zeros(push),
+            np.zeros(push), np.zeros(state), np.zeros(state), np.zeros(push), np.zeros(state), np.zeros(both),
+            np.zeros(both), np.zeros(count, dtype=np.int64), np.zeros((6, count)),
+        )  # fmt: skip
 
 
 @compiled_bare

@@ -367,6 +367,20 @@ def test_a_linear_price_is_a_bounded_force(w2: float) -> None:
     assert (push <= expected * (1.0 + 1e-9)).all()
 
 
+@pytest.mark.parametrize("w2", [1e-14, 1e-10, 1e-6, 1e-2])
+@pytest.mark.parametrize("copies", [1, 3])
+def test_a_slack_of_one_row_without_a_linear_price_may_be_as_soft_as_it_likes(w2: float, copies: int) -> None:
+    """It pulls with w2 times its slack: next to nothing, but to the digit; softest ones to 1e-12."""
+    result = certified(one(wall(-1.0, 0.0, w2, copies)))
+    slack, stages = result.slacks[0][0, 0], len(GRID)
+    beyond = np.repeat(result.states[0, 0, :, :1] + 1.0, copies, axis=1)
+    np.testing.assert_allclose(slack, np.maximum(0.0, beyond), atol=1e-9)
+    pull = result.y[0, 0, 12 * stages : (12 + copies) * stages].reshape(stages, copies)
+    np.testing.assert_allclose(
+        pull, w2 * slack * np.array(GRID)[:, None], rtol=1e-6, atol=1e-14 if w2 > 1e-12 else 1e-12
+    )
+
+
 def test_a_slack_that_costs_nothing_holds_nothing() -> None:
     result = certified(one(wall(-1.0, 0.0, 0.0)))
     np.testing.assert_allclose(result.states, certified(one()).states, atol=1e-6)
