@@ -44,6 +44,8 @@ UPSET_RAD = 1.0
 """Roll or pitch beyond which the model about hover is worth nothing: the inner loop levels the UAV first."""
 SLOT_PART, OPENING_MPS = 0.7, 1.0
 """What is asked of neighbours at most: this part of the distance of their slots, and no faster parting."""
+STUCK_PART, STUCK_M = 0.3, 2.0
+"""A plan that gets less than this part of its reference's way ahead, if that is farther than this, is stuck."""
 REPULSION_PART = 0.5
 """NAPF's repulsion pulls with this part of the contact price at most: it never outbids the margin itself."""
 LEAVING_MPS = 2.0
@@ -247,6 +249,13 @@ class QpPlanner:
             plan = straight_plan(self.problem.vehicle, self._yaw, time_s, step_s, state, velocity)
         states, inputs = plan.resampled(time_s, step_s)
         states[..., POSITION] += (state - plan.at(time_s)[0])[:, :, None, POSITION]
+        if self._guidance is not None:
+            # Rows made at a plan that stands before an obstacle hold it there: the guide's way leads past.
+            now = self._frame.along_track(state[..., POSITION])
+            asked = self._frame.along_track(reference[:, :, -1, POSITION]) - now
+            planned = self._frame.along_track(states[:, :, -1, POSITION]) - now
+            stuck = (asked > STUCK_M) & (planned < STUCK_PART * asked)
+            states = np.where(stuck[..., None, None], reference, states)
         return states, inputs
 
     def _horizon(self, guess: Array, nav: NavSolution, trusted: Mask, time_s: float) -> Horizon:

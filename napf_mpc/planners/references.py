@@ -16,7 +16,7 @@ from napf_mpc.qp import STATES
 from napf_mpc.vehicle.plant import plain
 
 Array = NDArray[np.float64]
-LARGEST_PULL_M = 3.0
+LARGEST_PULL_M = 4.0
 """A slot farther than this counts as this far: the UAV comes back at its speed limit, without a lunge."""
 
 
