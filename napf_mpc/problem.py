@@ -675,7 +675,7 @@ class Planner(_Section):
     """QP planner: weight of the torques [1/(N^2 m^2 s)]."""
     contact_price: float = Field(300.0, ge=0.0, le=1e9)
     """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]."""
-    contact_extra_m: float = Field(0.0, ge=0.0, le=1e3)
+    contact_extra_m: float = Field(0.2, ge=0.0, le=1e3)
     """QP planner: distance kept from obstacles on top of the margin."""
     altitude_m: tuple[Coordinate, Coordinate] | None = None
     """QP planner: least and largest height to fly at; none by default."""

@@ -42,7 +42,7 @@ NEIGHBOURS = 3
 """Neighbours that each stage of each UAV keeps rows for, at most."""
 UPSET_RAD = 1.0
 """Roll or pitch beyond which the model about hover is worth nothing: the inner loop levels the UAV first."""
-SLOT_PART, OPENING_MPS = 0.7, 1.0
+SLOT_PART, OPENING_MPS = 0.8, 1.0
 """What is asked of neighbours at most: this part of the distance of their slots, and no faster parting."""
 STUCK_PART, STUCK_M = 0.3, 2.0
 """A plan that gets less than this part of its reference's way ahead, if that is farther than this, is stuck."""
