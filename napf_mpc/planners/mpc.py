@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -63,7 +64,8 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     contact = ObstacleContact(
         obstacles=rows, w1=price, extra_m=settings.contact_extra_m, opening_mps=LEAVING_MPS
     )
-    influence = ObstacleInfluence(obstacles=rows, per_speed=settings.influence_scale, most=REPULSION_PART * price)
+    most = REPULSION_PART * price if price > 0.0 else math.inf
+    influence = ObstacleInfluence(obstacles=rows, per_speed=settings.influence_scale, most=most)
     neighbours = min(NEIGHBOURS, problem.uav_count - 1)
     apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
     others: list[Constraint] = [apart] if neighbours else []
