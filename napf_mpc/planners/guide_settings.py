@@ -35,7 +35,7 @@ class GuidanceSettings:
     """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
     path: float = 3.5
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
-    shape: float = 7.5
+    shape: float = 9.0
     """Price of a squared difference to the mean of all offsets [1/m^2 per metre]."""
     far_m: float = 7.0
     """Offsets beyond this are priced linearly [m]."""
@@ -49,7 +49,7 @@ class GuidanceSettings:
     """Price of a squared difference to the last profile [1/m^2 per metre]."""
     keep_m: float = 4.0
     """Differences beyond this cost no more: another side may be taken if it is clearly cheaper [m]."""
-    spare_m: float = 0.3
+    spare_m: float = 0.5
     """Distance kept beyond radius and k sigma, where there is room [m]."""
     spare: float = 200.0
     """Price of a squared lack of spare [1/m^2 per metre]."""
