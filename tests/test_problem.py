@@ -99,6 +99,13 @@ def test_one_measure_of_confidence() -> None:
     assert Planner(sigma="chi2", confidence=0.99).confidence == 0.99
 
 
+def test_a_height_band_is_only_kept_if_asked_for() -> None:
+    assert Planner().altitude_m is None
+    assert Planner(altitude_m=(-2.0, 3.0)).altitude_m == (-2.0, 3.0)
+    # Among the towers: no roof of the map is below 60 m, so none is to be passed under.
+    assert load_problem("nishi_shinjuku").planner.altitude_m == (70.0, 120.0)
+
+
 CYLINDER = {"shape": "cylinder", "centre_m": (0.0, 0.0), "radius_m": 1.0}
 PRISM = {"shape": "prism", "footprint_m": ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)), "top_m": 1.0}
 
@@ -114,6 +121,8 @@ PRISM = {"shape": "prism", "footprint_m": ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)), 
         (PrismObstacle, PRISM | {"base_m": 1.0}, "top_m = 1"),
         (City, {"kind": "city", "file": "x.geojson", "origin_latitude_deg": 35.0}, "go together"),
         (Planner, {"min_distance_m": 5.0}, "min_distance_m = 5"),
+        (Planner, {"altitude_m": (5.0, 5.0)}, r"low < high, got \[5, 5\]"),
+        (Planner, {"altitude_m": (120.0, 70.0)}, r"low < high, got \[120, 70\]"),
     ],
 )
 def test_relations_inside_a_section(model: type, values: dict[str, Any], words: str) -> None:

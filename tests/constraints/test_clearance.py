@@ -13,6 +13,7 @@ from napf_mpc.constraints.clearance import (
     Gaps,
     ObstacleContact,
     ObstacleInfluence,
+    distance_of_force,
     influence_model,
 )
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
@@ -229,6 +230,113 @@ def test_the_influence_rows_pull_with_napfs_force(mode: str, per_speed: float) -
         assert -slope[free] == pytest.approx(per_speed * force[free, axis], rel=1e-4, abs=1e-3)
 
 
+# ------------------------------------------------------------------ inside a margin, and how it is left
+
+
+def moving(horizon: Horizon, *east_m: float) -> Horizon:
+    """The same horizon with its plan at these places east, from now on."""
+    position = horizon.position.copy()
+    position[..., 0] = east_m
+    return replace(horizon, position=position)
+
+
+@pytest.mark.parametrize(("step_s", "asked_m"), [(0.1, [0.2, 0.4, 0.6]), (0.5, [1.0, 1.55, 1.55])])
+def test_a_margin_is_left_at_the_opening_speed_and_no_farther_than_to_its_edge(
+    step_s: float, asked_m: list[float]
+) -> None:
+    """1.55 m too little, as above; at 2 m/s a plan that stands lacks what it should have left by then."""
+    horizon = hover_at((7.5, 0.0, 50.0), EAST_SPHERE, step_s=step_s, of=problem(radius_m=0.3))
+    rows = ObstacleContact(Inflation(3.0), extra_m=0.25, opening_mps=2.0).rows(horizon)
+    assert rows.violation(horizon.position).max(-1)[0, 0] == pytest.approx(asked_m, abs=1e-9)
+    # A plan made linear on its way in or out is asked for the same places.
+    for way in ((7.5, 7.0, 6.0), (7.5, 7.7, 7.9)):
+        bent = moving(horizon, *way)
+        rows = ObstacleContact(Inflation(3.0), extra_m=0.25, opening_mps=2.0).rows(bent)
+        assert rows.violation(horizon.position).max(-1)[0, 0] == pytest.approx(asked_m, abs=1e-9)
+
+
+def test_where_nothing_is_short_now_no_row_changes_however_the_plan_goes_on() -> None:
+    horizon = moving(hover_at((5.0, 0.0, 50.0), EAST_SPHERE, of=problem(radius_m=0.3)), 5.0, 7.0, 9.0)
+    at_once = ObstacleContact(Inflation(3.0), extra_m=0.25)
+    bounded = replace(at_once, opening_mps=2.0)
+    assert at_once.rows(horizon).violation(horizon.position).max() > 2.0
+    for name in ("jac", "lower", "w1", "w2"):
+        np.testing.assert_array_equal(
+            getattr(bounded.rows(horizon), name), getattr(at_once.rows(replace(horizon)), name)
+        )
+
+
+def test_among_many_obstacles_only_the_rows_that_are_short_now_ask_for_less() -> None:
+    drawn, inflation = random_states(300, "shift", k=3.0)
+    repeated = {
+        name: np.repeat(getattr(drawn, name), 3, axis=2) for name in ("position", "velocity", "covariance")
+    }
+    horizon = replace(drawn, step_s=np.full(3, 0.1), **repeated)
+    gaps = Gaps.of(horizon, inflation, 4, 10.0)
+    there = np.isfinite(gaps.shifted)
+    at_once = ObstacleContact(inflation, extra_m=0.2).rows(horizon).lower
+    bounded = ObstacleContact(inflation, extra_m=0.2, opening_mps=2.0).rows(horizon).lower
+    assert at_once is not None
+    assert bounded is not None
+    short = there & (gaps.shifted < 0.2)
+    assert 200 < short.sum() < there.sum() - 200
+    np.testing.assert_array_equal(bounded[~short], at_once[~short])
+    opened = 0.2 * np.arange(1.0, 4.0)[:, None]
+    spared = np.where(short, np.maximum(0.2 - gaps.shifted - opened, 0.0), 0.0)
+    np.testing.assert_allclose(at_once[short] - bounded[short], spared[short], atol=1e-9)
+
+
+def test_the_shortfall_is_metres_inside_the_margin_and_not_the_slack() -> None:
+    """A plan that leaves as fast as it is asked has no slack, and yet it is inside the margin."""
+    horizon = hover_at((7.5, 0.0, 50.0), EAST_SPHERE, of=problem(radius_m=0.3))
+    contact = ObstacleContact(Inflation(3.0), extra_m=0.25, opening_mps=2.0)
+    plan = moving(horizon, 7.3, 7.1, 6.9).position
+    assert contact.rows(horizon).violation(plan).max() == pytest.approx(0.0, abs=1e-9)
+    assert contact.shortfall(horizon, plan) == pytest.approx(np.array([[1.35]]), abs=1e-9)
+    assert contact.shortfall(horizon, moving(horizon, 5.0, 5.95, 5.9).position) == pytest.approx(0.0, abs=1e-9)
+    assert contact.shortfall(horizon, moving(horizon, 5.0, 6.5, 5.9).position) == pytest.approx(0.55, abs=1e-9)
+    nothing = hover_at((7.5, 0.0, 50.0), ObstacleSet.empty())
+    np.testing.assert_array_equal(contact.shortfall(nothing, nothing.position), 0.0)
+
+
+@pytest.mark.parametrize("influence_m", [0.5, 3.0, 15.0, 40.0])
+def test_the_distance_of_a_force_is_where_the_field_has_it(influence_m: float) -> None:
+    ratio = np.geomspace(1e-9, 1e9, 37)
+    for force in ratio:
+        rho = distance_of_force(float(force), np.array([influence_m]))
+        assert 0.0 < rho[0] < influence_m
+        assert apf.repulsion(rho, 1.0, influence_m, 1e-9)[0] == pytest.approx(force, rel=1e-9)
+    assert distance_of_force(0.0, np.array([influence_m]))[0] == pytest.approx(influence_m, rel=1e-12)
+
+
+@pytest.mark.parametrize("mode", ["shift", "range"])
+def test_napfs_pull_is_capped_and_below_the_cap_it_is_napfs(mode: str) -> None:
+    horizon, _ = random_states(1000, mode, k=3.0)
+    settings, most = horizon.problem.planner, 40.0
+    constraint = ObstacleInfluence(obstacles=6, per_speed=0.4, most=most)
+    rows = constraint.rows(horizon)
+    gaps = constraint.gaps(horizon, settings.influence_m)
+    force = 0.4 * apf.repulsion(
+        gaps.shifted, settings.repulsive_gain, gaps.influence, settings.min_distance_m
+    )
+    assert rows.w2 is not None
+    pull = rows.w2 * rows.violation(horizon.position)
+    free, held = (force > 0.0) & (force < most), force > most
+    assert free.sum() > 200
+    assert held.sum() > 50
+    np.testing.assert_allclose(pull[free], force[free], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(pull[held], most, rtol=1e-9)
+    np.testing.assert_array_equal(pull[force == 0.0], 0.0)
+
+
+def test_a_cap_above_what_napf_ever_pulls_changes_nothing() -> None:
+    horizon, inflation = random_states(200, "shift", k=3.0)
+    free = ObstacleInfluence(inflation, per_speed=0.01).rows(horizon)
+    capped = ObstacleInfluence(inflation, per_speed=0.01, most=1e6).rows(horizon)
+    for name in ("jac", "lower", "w2"):
+        np.testing.assert_array_equal(getattr(capped, name), getattr(free, name))
+
+
 def test_the_influence_is_the_force_and_its_slope_and_nothing_is_divided_by_zero() -> None:
     rho = np.array([-4.0, 0.0, 0.05, 0.1, 0.5, 2.999999, 3.0, 3.1, 50.0, np.inf])
     weight, target = influence_model(rho, 15.0, 3.0, 0.1)
@@ -338,7 +446,9 @@ def test_walls_and_roofs_have_the_margin_of_a_wall() -> None:
         ObstacleContact(Inflation(3.0, "range"), obstacles=2),
         ObstacleContact(Inflation(3.0, reading="largest")),
         ObstacleContact(margin="exact"),
+        ObstacleContact(extra_m=0.2, opening_mps=2.0),
         ObstacleInfluence(),
+        ObstacleInfluence(most=5.0),
         ObstacleInfluence(Inflation(1.0, reading="rms"), obstacles=8),
         ObstacleInfluence(margin="exact"),
     ],
@@ -381,6 +491,12 @@ def test_settings_that_mean_nothing_are_refused(settings: dict[str, Any]) -> Non
         ObstacleContact(**settings)
     with pytest.raises(ConstraintError, match="per_speed"):
         ObstacleInfluence(per_speed=np.nan)
+    for speed in (0.0, -1.0, np.nan):
+        with pytest.raises(ConstraintError, match="opening_mps"):
+            ObstacleContact(opening_mps=speed)
+    for most in (0.0, -1.0, np.nan):
+        with pytest.raises(ConstraintError, match="most"):
+            ObstacleInfluence(most=most)
 
 
 def test_the_exact_margin_does_not_go_with_a_sigma_without_direction() -> None:

@@ -1,6 +1,8 @@
 """The QP planner keeps what it is asked to; whatever its solver does, what flies is sound and counted."""
 
 import itertools
+import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -9,10 +11,11 @@ import pytest
 
 from napf_mpc.block import simulate
 from napf_mpc.constraints.constraint import Horizon, LinearRows
-from napf_mpc.constraints.limits import TiltLimit
+from napf_mpc.constraints.limits import AltitudeBand, TiltLimit
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.mpc import QpPlanner, default_constraints
+from napf_mpc.planners.plan import standing_plan
 from napf_mpc.planners.planner import Command, Reason
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
@@ -59,6 +62,26 @@ def cruising(planner: QpPlanner) -> np.ndarray:
     return np.broadcast_to(2.0 * planner._frame.along, (1, 4, 3)).copy()
 
 
+def wall_beside(planner: QpPlanner, gap_m: float) -> tuple[float, int]:
+    """Give a planner a long wall so far to the left of the left-most slot: its face [m], and the UAV there."""
+    slots = on_slots(planner)
+    at = int(slots[0, :, 1].argmax())
+    face = float(slots[0, at, 1]) + gap_m
+    wall = Box((50.0, face + 1.0, 0.0), (200.0, 2.0, 50.0), 0.0)
+    planner.reset(ObstacleSet.from_shapes([wall]), 1)
+    return face, at
+
+
+def followed(solution: NavSolution, command: Command, time_s: float) -> NavSolution:
+    """Where the plans say that UAVs are at a time."""
+    assert command.plan is not None
+    state, _ = command.plan.at(time_s)
+    return replace(
+        solution, time_s=time_s, position=state[..., 0:6:2], velocity=state[..., 1:6:2],
+        attitude=state[..., 6:12:2], body_rates=state[..., 7:12:2],
+    )  # fmt: skip
+
+
 # ------------------------------------------------------------------------------------------ what it plans
 
 
@@ -78,24 +101,169 @@ def test_a_plan_keeps_k_sigma_and_its_radius_clear_of_a_wall_beside_the_lane() -
     asked = problem(planner={"kind": "qp", "influence_scale": 1e-6, "guidance": "none"})
     planner = QpPlanner(asked)
     slots = on_slots(planner)
-    # A long wall whose face is half a metre inside the left-most lane's margin of 3 * 0.3 + 0.3 m.
-    face = slots[0, :, 1].max() + 0.7
-    wall = Box((50.0, face + 1.0, 0.0), (200.0, 2.0, 50.0), 0.0)
-    planner.reset(ObstacleSet.from_shapes([wall]), 1)
+    # The face is 0.7 m inside the margin of 3 * 0.3 + 0.3 m and what is kept on top of it.
+    face, at = wall_beside(planner, 0.7)
     solution = nav(slots, cruising(planner))
     for tick in range(80):
-        command = planner.step(solution, 0.1 * tick)
-        assert command.plan is not None
-        state, _ = command.plan.at(0.1 * (tick + 1))
-        solution = replace(
-            solution, position=state[..., 0:6:2], velocity=state[..., 1:6:2], attitude=state[..., 6:12:2],
-            body_rates=state[..., 7:12:2],
-        )  # fmt: skip
+        solution = followed(solution, planner.step(solution, 0.1 * tick), 0.1 * (tick + 1))
     position = solution.position
-    at = int(slots[0, :, 1].argmax())
-    assert face - position[0, at, 1] == pytest.approx(0.3 + 3.0 * 0.3, abs=0.02)
+    kept = 0.3 + 3.0 * 0.3 + asked.planner.contact_extra_m
+    assert face - position[0, at, 1] == pytest.approx(kept, abs=0.02)
     others = [uav for uav in range(4) if uav != at]
     np.testing.assert_allclose(position[0, others, 1], slots[0, others, 1], atol=0.35)
+
+
+def test_what_is_reported_as_slack_is_how_far_the_plan_is_inside_a_margin() -> None:
+    """Deep inside, where the rows ask for less than the margin: in metres, from the plan and the wall."""
+    planner = QpPlanner(problem(), guided=False)
+    face, at = wall_beside(planner, 0.4)
+    command = planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
+    assert command.plan is not None
+    assert command.slack_m is not None
+    kept = 0.3 + 3.0 * 0.3 + planner.problem.planner.contact_extra_m
+    inside = kept - (face - command.plan.states[0, :, :, 2])
+    assert 0.9 < inside[at].max() < kept - 0.4
+    np.testing.assert_allclose(command.slack_m[0], np.maximum(inside.max(-1), 0.0), atol=1e-9)
+    assert planner.tally.largest_slack_m[0] == command.slack_m[0, at]
+
+
+def test_a_sigma_of_tens_of_metres_makes_no_lunge() -> None:
+    """A wall 5 m beside, and a margin that has grown to 60 m: it is left within the limits."""
+    planner = QpPlanner(problem(), guided=False)
+    _, at = wall_beside(planner, 5.0)
+    command = planner.step(nav(on_slots(planner), cruising(planner), sigma_m=20.0), 0.0)
+    assert command.plan is not None
+    states = command.plan.states[0]
+    assert states[at, -1, 2] < states[at, 0, 2] - 3.0  # away from the wall
+    assert np.abs(states[..., 3]).max() < 3.0 + 1e-2
+    assert np.abs(states[..., 6:10:2]).max() < math.radians(30.0) + 1e-3
+
+
+@pytest.mark.parametrize(("heading_deg", "axis"), [(0.0, 0), (90.0, 1), (30.0, None)])
+def test_a_large_east_sigma_leaves_the_height_believed(heading_deg: float, axis: int | None) -> None:
+    """Along, left and up of the path; a filter's estimate is believed whole."""
+    free = {"initial_positions_m": None, "initial_velocities_mps": None}
+    planner = QpPlanner(problem(mission=SHORT["mission"] | free | {"heading_deg": heading_deg}), guided=False)
+    planner.reset(ObstacleSet.empty(), 1)
+    low = on_slots(planner) - np.array([0.0, 0.0, 1.0])
+    solution = nav(low)
+    covariance = solution.covariance.copy()
+    covariance[..., :3, :3] = np.diag([10.0**2, 0.2**2, 0.1**2])
+    solution = replace(solution, covariance=covariance)
+    sigma = planner._sigma(solution, solution.trusted())
+    assert sigma.shape == (1, 4, 3)
+    if axis is None:
+        turn = math.radians(heading_deg)
+        wanted = [
+            math.hypot(10.0 * math.cos(turn), 0.2 * math.sin(turn)),
+            math.hypot(10.0 * math.sin(turn), 0.2 * math.cos(turn)),
+            0.1,
+        ]
+    else:
+        wanted = [0.2, 0.2, 0.1]
+        wanted[axis] = 10.0
+    np.testing.assert_allclose(sigma, np.broadcast_to(wanted, (1, 4, 3)), rtol=1e-9)
+    np.testing.assert_array_equal(
+        planner._sigma(replace(solution, filtered=True), solution.trusted()), np.zeros((1, 4, 3))
+    )
+    # Of the missing metre of height all but a hundredth is asked for, and so it is climbed.
+    climbed = planner.build(solution, 0.0).reference[..., 4]
+    np.testing.assert_allclose(climbed, 1.0 / 1.01, rtol=1e-9)
+    climbed = planner.build(replace(solution, filtered=True), 0.0).reference[..., 4]
+    np.testing.assert_allclose(climbed, 1.0, rtol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------ height band
+
+
+def over_a_wall(altitude_m: list[float] | None) -> np.ndarray:
+    """Heights every 0.1 s of one UAV without errors whose lane, at height 0, meets a wall's top at 0.5 m below."""
+    given = {
+        "formation": {"shape": "line", "count": 1},
+        "mission": {"kind": "formation", "length_m": 24.0},
+        "world": {
+            "kind": "list",
+            "obstacles": [{"shape": "box", "centre_m": [12.0, 0.0, -10.5], "size_m": [2.0, 60.0, 20.0]}],
+        },
+        "navigation": {
+            "kind": "gauss_markov", "error_scale": 0.0, "sigma_min_m": 0.2, "sigma_max_m": 0.3,
+        },
+        "simulation": {"time_limit_s": 20.0},
+        "planner": {"kind": "qp", "guidance": "none", "altitude_m": altitude_m},
+    }  # fmt: skip
+    missions = simulate(Problem.model_validate_json(json.dumps(given)), "qp", seed=1, runs=1, record_every=5)
+    assert missions.score.finished.all()
+    assert not missions.score.obstacle_contact.any()
+    return np.asarray(missions.trajectories["z_m"])
+
+
+def test_a_height_band_is_kept_in_flight() -> None:
+    assert over_a_wall(None).max() > 0.8  # its margin lifts it so far
+    low = over_a_wall([-5.0, 0.6])
+    assert 0.5 < low.max() < 0.6 + 0.01
+
+
+def test_a_height_band_is_rows_of_the_program_and_none_by_default() -> None:
+    def bands(asked: Problem) -> list[tuple[float, float]]:
+        made = default_constraints(asked)
+        return [(each.min_m, each.max_m) for each in made if isinstance(each, AltitudeBand)]
+
+    assert bands(problem()) == []
+    assert bands(problem(planner={"kind": "qp", "altitude_m": (-2.0, 3.5)})) == [(-2.0, 3.5)]
+
+
+# ------------------------------------------------------------------------------------ plans that stand
+
+
+def test_a_plan_that_stands_though_its_guide_leads_on_is_taken_from_the_guide() -> None:
+    planner = QpPlanner(problem(mission={"length_m": 60.0}))
+    planner.reset(ObstacleSet.empty(), 1)
+    slots = on_slots(planner)
+    state = planner._state(nav(slots), np.ones((1, 4), dtype=bool))
+    leads = planner._slots.over(slots, planner._model.times_s)
+    ahead = leads[0, 0, -1, 0] - slots[0, 0, 0]
+    assert ahead == pytest.approx(2.0 * planner._model.times_s[-1])  # some 13 m
+
+    def guess(reference: np.ndarray, planned_m: float) -> np.ndarray:
+        """Places of the guess of the first UAV, where its last plan went so far and the others' stood."""
+        plan = standing_plan(
+            planner.problem.vehicle, planner._yaw, 0.0, planner._model.step_s, state[..., 0:6:2]
+        )
+        plan.states[0, 0, :, 0] += planned_m * planner._model.times_s / planner._model.times_s[-1]
+        planner._plan = plan
+        return planner._guess(state, reference, 0.0)[0][..., 0:6:2]
+
+    np.testing.assert_array_equal(guess(leads, 0.0), leads[..., 0:6:2])
+    # One that gets along by itself is left alone, and so are all where the guide holds as well.
+    going = guess(leads, 0.35 * ahead)
+    assert going[0, 0, -1, 0] - slots[0, 0, 0] == pytest.approx(0.35 * ahead)
+    np.testing.assert_array_equal(going[0, 1:], leads[0, 1:, :, 0:6:2])
+    holds = planner._slots.over(slots, planner._model.times_s)
+    holds[..., 0:6:2] = slots[:, :, None] + np.array([1.9, 0.0, 0.0])
+    np.testing.assert_allclose(
+        guess(holds, 0.0), np.broadcast_to(slots[:, :, None], (1, 4, planner._model.stages, 3)), atol=1e-12
+    )
+    planner._guidance = None
+    np.testing.assert_allclose(
+        guess(leads, 0.0), np.broadcast_to(slots[:, :, None], (1, 4, planner._model.stages, 3)), atol=1e-12
+    )
+
+
+def test_from_standing_before_a_wall_a_uav_is_led_past_it() -> None:
+    """12 m wide, at rest just outside its margin: rows made at a standing plan would hold it there for good."""
+    planner = QpPlanner(problem(mission={"length_m": 60.0}))
+    slots = on_slots(planner)
+    at = int(slots[0, :, 0].argmax())
+    first = slots[0, at]
+    wall = Box((first[0] + 0.3 + 0.9 + 0.2 + 1.0, first[1], 0.0), (2.0, 12.0, 200.0))
+    planner.reset(ObstacleSet.from_shapes([wall]), 1)
+    solution = nav(slots)
+    nearest = np.inf
+    for tick in range(150):
+        solution = followed(solution, planner.step(solution, 0.1 * tick), 0.1 * (tick + 1))
+        nearest = min(nearest, float(planner._obstacles.signed_distance(solution.position).min()) - 0.3)
+    assert (solution.position[0, :, 0] - slots[0, :, 0]).min() > 10.0
+    assert nearest > 0.9 - 0.4  # three sigma, less what a corner costs
 
 
 def test_a_command_does_not_depend_on_which_other_runs_are_flown_with_it() -> None:

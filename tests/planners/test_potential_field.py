@@ -271,7 +271,9 @@ def test_a_run_gets_the_same_bits_alone_and_in_company(kind: type, sigma: str) -
         alone = kind(problem(planner={"k": 1.7, "sigma": sigma}))
         alone.reset(scenes.scene(run), 1)
         of_run = [getattr(nav, field.name) for field in fields(NavSolution)[1:]]
-        part = NavSolution(0.0, *(None if values is None else values[run : run + 1] for values in of_run))
+        part = NavSolution(
+            0.0, *(each[run : run + 1] if isinstance(each, np.ndarray) else each for each in of_run)
+        )
         command = alone.step(part, 0.0)
         for field in fields(Command):
             mine, theirs = getattr(command, field.name), getattr(all_runs, field.name)

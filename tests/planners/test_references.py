@@ -52,6 +52,37 @@ def test_a_pull_is_no_longer_than_a_lunge() -> None:
     np.testing.assert_allclose(pull[0, 1:] / LARGEST_PULL_M, [-0.6, -0.8])
 
 
+def test_a_measurements_error_is_believed_axis_by_axis() -> None:
+    """1 m along, left and up of the slots; what sigma explains is not asked for, on its own axis only."""
+    reference = slots(37.0)
+    miss = np.array([[1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+    here = places(reference, 30.0, miss)
+
+    def asked(sigma_m: np.ndarray | float) -> np.ndarray:
+        out = reference.over(here, np.array([0.0]), sigma_m)[0, :, 0, 0:6:2]
+        return reference.frame.to_path(out) - reference.frame.to_path(here[0])
+
+    np.testing.assert_allclose(asked(np.zeros((1, 2, 3))), -miss, atol=1e-12)
+    np.testing.assert_allclose(asked(0.0), -miss, atol=1e-12)
+    for axis in range(3):
+        sigma = np.full((1, 2, 3), 0.1)
+        sigma[..., axis] = 10.0
+        part = np.full(3, 1.0 / 1.01)
+        part[axis] = 1.0 / 101.0
+        np.testing.assert_allclose(asked(sigma), -miss * part, atol=1e-12)
+    only_one = np.zeros((1, 2, 3))
+    only_one[0, 0] = 1.0
+    np.testing.assert_allclose(asked(only_one), [[-0.5, -0.5, 0.5], [1.0, 1.0, -1.0]], atol=1e-12)
+
+
+def test_a_far_slot_is_believed_whatever_sigma_says_of_its_other_axes() -> None:
+    reference = slots()
+    high = places(reference, 30.0, np.array([[0.0, 0.0, 20.0], [0.0, 0.0, 0.0]]))
+    sigma = np.broadcast_to([50.0, 50.0, 1.0], (1, 2, 3))
+    pull = reference.over(high, np.array([0.0]), sigma)[0, 0, 0, 0:6:2] - high[0, 0]
+    np.testing.assert_allclose(pull, [0.0, 0.0, -LARGEST_PULL_M * 400.0 / 401.0], atol=1e-9)
+
+
 def bend(pace: float = 1.0) -> Guide:
     """Offset that grows by 0.5 m to the left each metre from 2 m ahead on, up to 3 m, for the first UAV."""
     ahead = np.arange(0.0, 21.0)
