@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,8 @@ def maker(name: str, **settings: Any) -> MakeBackend:
     """
     if name not in qpsolvers.available_solvers:
         raise ImportError(f"qpsolvers finds no {name}")
+    if name == "highs":
+        _swallow_banner()
     chosen = {**DEFAULTS.get(name, {}), **settings}
     return lambda sparsity: QpsolversBackend(name, sparsity, chosen)
 
@@ -86,6 +89,24 @@ class QpsolversBackend:
         if len(b):
             y[equal] = solution.y
         return Answer(QpStatus.SOLVED, np.asarray(solution.x, dtype=float), y)
+
+
+@cache
+def _swallow_banner() -> None:
+    """Let HiGHS write its banner to nowhere.
+
+    From 1.16 on, whatever first enables the callbacks of an instance writes it, once a process, and the
+    constructor enables them before anybody can turn the console off.
+    """
+    import highspy
+
+    highs: Any = highspy.Highs
+
+    def enable_mute(instance: Any) -> None:
+        instance.setOptionValue("log_to_console", False)
+        highs.enableCallbacks(instance)
+
+    type("Mute", (highs,), {"enableCallbacks": enable_mute})()
 
 
 def _own_status(solution: Any) -> str:
