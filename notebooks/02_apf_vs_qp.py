@@ -20,7 +20,8 @@
 #
 # Every number and picture below is computed here. How many missions stand behind the table follows from
 # the variable `NAPF_MPC_NOTEBOOK_RUNS` (300 unless set; a tenth of it is flown, since a QP mission takes
-# seconds). The first solve of an installation compiles the solver for about a minute.
+# seconds). The first solve of an installation compiles the solver and its guidance: a little over two
+# minutes on one core.
 
 # %%
 import os
