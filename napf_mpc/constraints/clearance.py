@@ -298,8 +298,8 @@ class ObstacleContact(_Shell):
     extra_m: float = 0.0
     """Distance kept on top of the margin [m]."""
     opening_mps: float | None = None
-    """A UAV that is inside a margin now is asked to leave it at this speed, not at once: a sigma that jumps by
-    tens of metres must not make it lunge. None asks at once [m/s]."""
+    """A UAV that is inside a margin now is asked to leave it at this speed, not at once: a sigma that jumps
+    by tens of metres must not make it lunge. None asks at once [m/s]."""
     w1: float = CONTACT_W1
     """Linear price of the slack [1/(m s)]."""
     w2: float = CONTACT_W2
@@ -399,7 +399,7 @@ def distance_of_force(ratio: float, influence_m: Array) -> Array:
         rho_0 [m].
     """
     slope = 1.0 / influence_m
-    # x^2 (x - 1/rho_0) of x = 1/rho is convex and rising beyond 1/rho_0: Newton's steps from above stay there.
+    # x^2 (x - 1/rho_0) of x = 1/rho is convex and rises beyond 1/rho_0: Newton's steps from above stay there.
     x = slope + ratio ** (1.0 / 3.0)
     for _ in range(NEWTON_STEPS):
         x -= (x * x * (x - slope) - ratio) / (x * (3.0 * x - 2.0 * slope))

@@ -45,7 +45,7 @@ UPSET_RAD = 1.0
 SLOT_PART, OPENING_MPS = 0.8, 1.0
 """What is asked of neighbours at most: this part of the distance of their slots, and no faster parting."""
 STUCK_PART, STUCK_M = 0.3, 2.0
-"""A plan that gets less than this part of its reference's way ahead, if that is farther than this, is stuck."""
+"""A plan is stuck if it gets less than this part of its reference's way ahead, and that is farther than this."""
 REPULSION_PART = 0.5
 """NAPF's repulsion pulls with this part of the contact price at most: it never outbids the margin itself."""
 LEAVING_MPS = 2.0
@@ -63,7 +63,9 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     contact = ObstacleContact(
         obstacles=rows, w1=price, extra_m=settings.contact_extra_m, opening_mps=LEAVING_MPS
     )
-    influence = ObstacleInfluence(obstacles=rows, per_speed=settings.influence_scale, most=REPULSION_PART * price)
+    influence = ObstacleInfluence(
+        obstacles=rows, per_speed=settings.influence_scale, most=REPULSION_PART * price
+    )
     neighbours = min(NEIGHBOURS, problem.uav_count - 1)
     apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
     others: list[Constraint] = [apart] if neighbours else []
@@ -186,7 +188,9 @@ class QpPlanner:
         guide = None
         if self._guidance is not None:
             guide = self._guidance.step(state[..., POSITION], covariance, trusted, time_s)
-        reference = self._slots.over(state[..., POSITION], self._model.times_s, self._sigma(nav, trusted), guide)
+        reference = self._slots.over(
+            state[..., POSITION], self._model.times_s, self._sigma(nav, trusted), guide
+        )
         began = 0.0 if self._clock is None else self._clock()
         answer = self._solve(state, reference, nav, trusted, time_s)
         late = self._clock is not None and not self._clock() - began <= self._period_s
@@ -224,7 +228,7 @@ class QpPlanner:
         )
 
     def _sigma(self, nav: NavSolution, trusted: Mask) -> Array:
-        """Standard deviations (run, uav, 3) of position measurements along, left and up; 0 of estimates [m]."""
+        """Sigmas (run, uav, 3) of position measurements along, left and up; 0 of estimates [m]."""
         if nav.filtered:
             return np.zeros((*trusted.shape, 3))
         covariance = np.where(trusted[..., None, None], nav.position_covariance, 0.0)

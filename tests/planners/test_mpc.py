@@ -63,7 +63,7 @@ def cruising(planner: QpPlanner) -> np.ndarray:
 
 
 def wall_beside(planner: QpPlanner, gap_m: float) -> tuple[float, int]:
-    """Give a planner a long wall so far to the left of the left-most slot: its face [m], and the UAV there."""
+    """Give a planner a long wall so far left of the left-most slot: its face [m], and the UAV there."""
     slots = on_slots(planner)
     at = int(slots[0, :, 1].argmax())
     face = float(slots[0, at, 1]) + gap_m
@@ -177,7 +177,7 @@ def test_a_large_east_sigma_leaves_the_height_believed(heading_deg: float, axis:
 
 
 def over_a_wall(altitude_m: list[float] | None) -> np.ndarray:
-    """Heights every 0.1 s of one UAV without errors whose lane, at height 0, meets a wall's top at 0.5 m below."""
+    """Heights every 0.1 s of one UAV without errors whose lane leads 0.5 m above the top of a wall [m]."""
     given = {
         "formation": {"shape": "line", "count": 1},
         "mission": {"kind": "formation", "length_m": 24.0},
@@ -250,7 +250,7 @@ def test_a_plan_that_stands_though_its_guide_leads_on_is_taken_from_the_guide() 
 
 
 def test_from_standing_before_a_wall_a_uav_is_led_past_it() -> None:
-    """12 m wide, at rest just outside its margin: rows made at a standing plan would hold it there for good."""
+    """12 m wide, at rest just outside its margin: rows made at a standing plan would hold it for good."""
     planner = QpPlanner(problem(mission={"length_m": 60.0}))
     slots = on_slots(planner)
     at = int(slots[0, :, 0].argmax())
@@ -528,8 +528,9 @@ def test_whatever_the_solver_returns_commands_are_sound_and_every_fall_back_is_c
         next(now)
         return moment[0]
 
+    # 15 s at full speed; every spoilt answer costs some of it.
     flown = problem(
-        navigation={"filter": "kalman"}, mission={"length_m": 30.0}, simulation={"time_limit_s": 20.0}
+        navigation={"filter": "kalman"}, mission={"length_m": 30.0}, simulation={"time_limit_s": 40.0}
     )
     faulty = Faulty(make_batch_solver("osqp"), 0.1, advance)
     pilot = Finite(QpPlanner(flown, solver=faulty, clock=clock))
