@@ -45,7 +45,7 @@ UPSET_RAD = 1.0
 SLOT_PART, OPENING_MPS = 0.8, 1.0
 """What is asked of neighbours at most: this part of the distance of their slots, and no faster parting."""
 STUCK_PART, STUCK_M = 0.3, 2.0
-"""A plan is stuck if it gets less than this part of its reference's way ahead, and that is farther than this."""
+"""A plan is stuck that gets less than this part of its reference's way ahead, of more than so many metres."""
 REPULSION_PART = 0.5
 """NAPF's repulsion pulls with this part of the contact price at most: it never outbids the margin itself."""
 LEAVING_MPS = 2.0

@@ -206,11 +206,10 @@ def test_nothing_costs_less_than_the_price_ahead_says(prices: Prices, part: floa
 
 
 def test_the_wide_lattice_has_the_same_shapes_and_twice_as_large() -> None:
-    """Prices of the wide lattice: twice the profile costs four times as much on it, whatever the profile.
+    """A profile of twice the size costs four times as much a metre there, in each of its parts.
 
-    A profile's price is that of its offsets, slopes and bends over the distance that is flown; with all
-    lengths doubled but that of the path's price each of them has to grow alike, or a wide margin would be
-    passed in another way than a narrow one.
+    Offsets, slopes and bends have to grow alike, or a wide margin would be passed in another way than a
+    narrow one: earlier, or in a sharper turn.
     """
     one, two, wide = SEARCH.prices, SEARCH.wide_prices, SEARCH.wide
     assert wide.step_m == pytest.approx(2.0 * LATTICE.step_m)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from napf_mpc.block import simulate
+from napf_mpc.constraints.clearance import ObstacleInfluence
 from napf_mpc.constraints.constraint import Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, TiltLimit
 from napf_mpc.errors import NapfError, ProblemError
@@ -125,6 +126,24 @@ def test_what_is_reported_as_slack_is_how_far_the_plan_is_inside_a_margin() -> N
     assert 0.9 < inside[at].max() < kept - 0.4
     np.testing.assert_allclose(command.slack_m[0], np.maximum(inside.max(-1), 0.0), atol=1e-9)
     assert planner.tally.largest_slack_m[0] == command.slack_m[0, at]
+
+
+def test_the_repulsion_never_outbids_the_margin_it_is_for() -> None:
+    """Deep inside, the force law of a wide scene would pull far harder than a metre of margin is worth."""
+    wide = {"kind": "qp", "influence_m": 15.0, "repulsive_gain": 5600.0}
+    planner = QpPlanner(problem(planner=wide), guided=False)
+    _, at = wall_beside(planner, 0.4)
+    planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
+    horizon = planner._last_horizon
+    assert horizon is not None
+    (influence,) = (each for each in planner.constraints if isinstance(each, ObstacleInfluence))
+    rows = influence.rows(horizon)
+    assert rows.w2 is not None
+    pull = (rows.w2 * rows.violation(horizon.position)).max(axis=(0, 2, 3))
+    assert pull[at] == pytest.approx(0.5 * planner.problem.planner.contact_price)
+    free = replace(influence, most=np.inf).rows(horizon)
+    assert free.w2 is not None
+    assert (free.w2 * free.violation(horizon.position)).max() > 10.0 * pull[at]
 
 
 def test_a_sigma_of_tens_of_metres_makes_no_lunge() -> None:
