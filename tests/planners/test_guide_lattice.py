@@ -19,6 +19,7 @@ from napf_mpc.planners.guide_clearance import (
 )
 from napf_mpc.planners.guide_lattice import (
     Bench,
+    Prices,
     Query,
     bend_offsets,
     bent,
@@ -38,6 +39,8 @@ Array = NDArray[np.float64]
 
 SEARCH = search_of(GuidanceSettings(widest_m=10.0, ahead_m=40.0), 3.0, 0.3)
 LATTICE, PRICES = SEARCH.lattice, SEARCH.prices
+GENTLE = PRICES._replace(path=1.5, slope=16.0, far_m=8.0)
+"""Prices for which the way back to the lane is nowhere steep, which :func:`price_ahead` leaves out."""
 BELOW, LAYERS, CELLS = 4, 9, 2 * LATTICE.half + 1
 LANE = np.array([3.0, 0.5])
 LEVEL = PathFrame.from_angles((5.0, -7.0, 2.0), 0.7, 0.0)
@@ -99,7 +102,9 @@ def all_missing(sight: Sight, shapes: list[Shape], path: PathFrame, i: int) -> A
     return out
 
 
-def exhaustive(node: Array, start: tuple[int, int], weight: float, aside: float) -> float:
+def exhaustive(
+    node: Array, start: tuple[int, int], weight: float, aside: float, prices: Prices = PRICES
+) -> float:
     """Least price through node prices (station, layer, cell), every place and step tried."""
     step, cell, layer = LATTICE.step_m, LATTICE.cell_m, LATTICE.layer_m
     value = np.full(node.shape[1:], np.inf)
@@ -115,7 +120,7 @@ def exhaustive(node: Array, start: tuple[int, int], weight: float, aside: float)
         best = np.full_like(value, np.inf)
         for dv, dc in product(range(-1, 2), range(-2, 3)):
             square = (dc * cell) ** 2 + (dv * layer) ** 2
-            edge = weight * PRICES.slope * steep(math.sqrt(square) / step, PRICES.steep) * square / step
+            edge = weight * prices.slope * steep(math.sqrt(square) / step, prices.steep) * square / step
             best = np.minimum(best, padded[1 - dv : 1 - dv + LAYERS, 2 - dc : 2 - dc + CELLS] + edge)
         value = best + node[s]
     return float(value.min())
@@ -141,10 +146,10 @@ def node_prices(sight: Sight, query: Query, missing: list[Array]) -> Array:
     return out
 
 
-def bench() -> Bench:
+def bench(prices: Prices = PRICES) -> Bench:
     made = make_scratch(2, 2 * LATTICE.stations - 1, 4, SEARCH).bench
-    bend_offsets(LATTICE, BELOW, LAYERS, PRICES, made.bend)
-    price_ahead(LATTICE, PRICES.path, PRICES.slope, made.ahead)
+    bend_offsets(LATTICE, BELOW, LAYERS, prices, made.bend)
+    price_ahead(LATTICE, prices.path, prices.slope, made.ahead)
     return made
 
 
@@ -189,11 +194,44 @@ def test_what_is_left_out_was_not_cheaper(seed: int, aside: float) -> None:
             chosen[0] = profile
 
 
-def test_nothing_costs_less_than_the_price_ahead_says() -> None:
+@pytest.mark.parametrize(("prices", "part"), [(GENTLE, 0.3), (PRICES, 0.15)])
+def test_nothing_costs_less_than_the_price_ahead_says(prices: Prices, part: float) -> None:
     """Where nothing is in the way: bound and least price, from every offset."""
-    made = bench()
-    own = LATTICE.step_m * PRICES.path * made.bend[:LAYERS, :CELLS]
+    made = bench(prices)
+    own = LATTICE.step_m * prices.path * made.bend[:LAYERS, :CELLS]
     node = np.concatenate([np.zeros((1, LAYERS, CELLS)), np.tile(own, (LATTICE.stations - 1, 1, 1))])
     for cell in range(0, CELLS, 3):
-        least = exhaustive(node, (BELOW, cell), 1.0, -1.0)
-        assert 0.3 * least < made.ahead[0] * made.bend[BELOW, cell] + 1e-9 <= least + 2e-9
+        least = exhaustive(node, (BELOW, cell), 1.0, -1.0, prices)
+        assert part * least < made.ahead[0] * made.bend[BELOW, cell] + 1e-9 <= least + 2e-9
+
+
+def test_the_wide_lattice_has_the_same_shapes_and_twice_as_large() -> None:
+    """A profile of twice the size costs four times as much a metre there, in each of its parts.
+
+    Offsets, slopes and bends have to grow alike, or a wide margin would be passed in another way than a
+    narrow one: earlier, or in a sharper turn.
+    """
+    one, two, wide = SEARCH.prices, SEARCH.wide_prices, SEARCH.wide
+    assert wide.step_m == pytest.approx(2.0 * LATTICE.step_m)
+    assert wide.cell_m == pytest.approx(2.0 * LATTICE.cell_m)
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        offset = np.cumsum(rng.normal(0.0, 1.5, (12, 2)), axis=0)
+        offset[0] *= 20.0 * rng.random()  # some far out
+
+        def price(profile: Array, step: float, by: Prices) -> Array:
+            """Offsets, slopes and bends, each per metre and summed over the stations (3,)."""
+            slope = np.diff(profile, axis=0) / step
+            bend = np.diff(slope, axis=0) / step
+            size = np.linalg.norm(slope, axis=-1)
+            return step * np.array(
+                [
+                    sum(by.path * bent(float(at @ at), by.far_m) for at in profile),
+                    sum(by.slope * steep(float(each), by.steep) * each**2 for each in size),
+                    by.bend * (bend**2).sum(),
+                ]
+            )
+
+        narrow = price(offset, LATTICE.step_m, one)
+        assert (narrow > 0.0).all()
+        np.testing.assert_allclose(price(2.0 * offset, wide.step_m, two), 8.0 * narrow, rtol=1e-12)

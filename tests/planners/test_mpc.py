@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from napf_mpc.block import simulate
+from napf_mpc.constraints.clearance import ObstacleInfluence
 from napf_mpc.constraints.constraint import Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, TiltLimit
 from napf_mpc.errors import NapfError, ProblemError
@@ -63,7 +64,7 @@ def cruising(planner: QpPlanner) -> np.ndarray:
 
 
 def wall_beside(planner: QpPlanner, gap_m: float) -> tuple[float, int]:
-    """Give a planner a long wall so far to the left of the left-most slot: its face [m], and the UAV there."""
+    """Give a planner a long wall so far left of the left-most slot: its face [m], and the UAV there."""
     slots = on_slots(planner)
     at = int(slots[0, :, 1].argmax())
     face = float(slots[0, at, 1]) + gap_m
@@ -127,6 +128,24 @@ def test_what_is_reported_as_slack_is_how_far_the_plan_is_inside_a_margin() -> N
     assert planner.tally.largest_slack_m[0] == command.slack_m[0, at]
 
 
+def test_the_repulsion_never_outbids_the_margin_it_is_for() -> None:
+    """Deep inside, the force law of a wide scene would pull far harder than a metre of margin is worth."""
+    wide = {"kind": "qp", "influence_m": 15.0, "repulsive_gain": 5600.0}
+    planner = QpPlanner(problem(planner=wide), guided=False)
+    _, at = wall_beside(planner, 0.4)
+    planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
+    horizon = planner._last_horizon
+    assert horizon is not None
+    (influence,) = (each for each in planner.constraints if isinstance(each, ObstacleInfluence))
+    rows = influence.rows(horizon)
+    assert rows.w2 is not None
+    pull = (rows.w2 * rows.violation(horizon.position)).max(axis=(0, 2, 3))
+    assert pull[at] == pytest.approx(0.5 * planner.problem.planner.contact_price)
+    free = replace(influence, most=np.inf).rows(horizon)
+    assert free.w2 is not None
+    assert (free.w2 * free.violation(horizon.position)).max() > 10.0 * pull[at]
+
+
 def test_a_sigma_of_tens_of_metres_makes_no_lunge() -> None:
     """A wall 5 m beside, and a margin that has grown to 60 m: it is left within the limits."""
     planner = QpPlanner(problem(), guided=False)
@@ -177,7 +196,7 @@ def test_a_large_east_sigma_leaves_the_height_believed(heading_deg: float, axis:
 
 
 def over_a_wall(altitude_m: list[float] | None) -> np.ndarray:
-    """Heights every 0.1 s of one UAV without errors whose lane, at height 0, meets a wall's top at 0.5 m below."""
+    """Heights every 0.1 s of one UAV without errors whose lane leads 0.5 m above the top of a wall [m]."""
     given = {
         "formation": {"shape": "line", "count": 1},
         "mission": {"kind": "formation", "length_m": 24.0},
@@ -250,7 +269,7 @@ def test_a_plan_that_stands_though_its_guide_leads_on_is_taken_from_the_guide() 
 
 
 def test_from_standing_before_a_wall_a_uav_is_led_past_it() -> None:
-    """12 m wide, at rest just outside its margin: rows made at a standing plan would hold it there for good."""
+    """12 m wide, at rest just outside its margin: rows made at a standing plan would hold it for good."""
     planner = QpPlanner(problem(mission={"length_m": 60.0}))
     slots = on_slots(planner)
     at = int(slots[0, :, 0].argmax())
@@ -528,8 +547,9 @@ def test_whatever_the_solver_returns_commands_are_sound_and_every_fall_back_is_c
         next(now)
         return moment[0]
 
+    # 15 s at full speed; every spoilt answer costs some of it.
     flown = problem(
-        navigation={"filter": "kalman"}, mission={"length_m": 30.0}, simulation={"time_limit_s": 20.0}
+        navigation={"filter": "kalman"}, mission={"length_m": 30.0}, simulation={"time_limit_s": 40.0}
     )
     faulty = Faulty(make_batch_solver("osqp"), 0.1, advance)
     pilot = Finite(QpPlanner(flown, solver=faulty, clock=clock))
