@@ -293,18 +293,9 @@ def test_the_shortfall_is_metres_inside_the_margin_and_not_the_slack() -> None:
     plan = moving(horizon, 7.3, 7.1, 6.9).position
     assert contact.rows(horizon).violation(plan).max() == pytest.approx(0.0, abs=1e-9)
     assert contact.shortfall(horizon, plan) == pytest.approx(np.array([[1.35]]), abs=1e-9)
-<<<<<<< HEAD
-    assert contact.shortfall(horizon, moving(horizon, 5.0, 5.95, 5.9).position) == pytest.approx(
-        0.0, abs=1e-9
-    )
-    assert contact.shortfall(horizon, moving(horizon, 5.0, 6.5, 5.9).position) == pytest.approx(
-        0.55, abs=1e-9
-    )
-=======
     for most_m, inside_m in ((5.95, 0.0), (6.5, 0.55)):
         plan = moving(horizon, 5.0, most_m, 5.9).position
         assert contact.shortfall(horizon, plan) == pytest.approx(inside_m, abs=1e-9)
->>>>>>> t1
     nothing = hover_at((7.5, 0.0, 50.0), ObstacleSet.empty())
     np.testing.assert_array_equal(contact.shortfall(nothing, nothing.position), 0.0)
 
