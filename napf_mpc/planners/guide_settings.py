@@ -41,7 +41,7 @@ class GuidanceSettings:
     """Offsets beyond this are priced linearly [m]."""
     slope: float = 6.0
     """Price of a squared slope [per metre]."""
-    steep: float = 0.7
+    steep: float = 0.3
     """Slope from which that price rises with the slope's fourth power."""
     bend: float = 10.0
     """Price of a squared change of slope per metre [m^2 per metre]."""
