@@ -208,7 +208,7 @@ def over_a_wall(altitude_m: list[float] | None) -> np.ndarray:
             "kind": "gauss_markov", "error_scale": 0.0, "sigma_min_m": 0.2, "sigma_max_m": 0.3,
         },
         "simulation": {"time_limit_s": 20.0},
-        "planner": {"kind": "qp", "guidance": "none", "altitude_m": altitude_m},
+        "planner": {"kind": "qp", "guidance": "none", "contact_extra_m": 0.2, "altitude_m": altitude_m},
     }  # fmt: skip
     missions = simulate(Problem.model_validate_json(json.dumps(given)), "qp", seed=1, runs=1, record_every=5)
     assert missions.score.finished.all()
