@@ -29,7 +29,7 @@ from napf_mpc.problem_file import load_problem
 from napf_mpc.risk import Paired, holm, paired_tests
 
 BLOCKS = {"development": 101, "report": 2027}
-"""Campaign seeds: settings were chosen on the first, and on no other; tables show the second."""
+"""Campaign seeds: settings were chosen on the first; tables show the second (see docs/comparison.md)."""
 
 FILTER = 'navigation.filter="kalman"'
 CELLS: dict[str, tuple[str, list[str]]] = {
