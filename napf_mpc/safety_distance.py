@@ -178,6 +178,13 @@ class Inflation:
         """Bound (...) on the margin over all directions: k times the root of the covariance's trace [m]."""
         return self.k * math.sqrt(3.0) * rms_sigma(covariance)
 
+    def margin_covariance(self, covariance: Array) -> Array:
+        """Covariance (..., 3, 3) whose k sigma along any direction is the margin, in every reading."""
+        if self.reading not in ("largest", "rms"):
+            return covariance
+        sigma = largest_sigma(covariance) if self.reading == "largest" else rms_sigma(covariance)
+        return np.asarray((sigma**2)[..., None, None] * np.eye(3))
+
     def apply(self, distance: Array, margin: Array, influence_m: float) -> tuple[Array, Array]:
         """Distance and range that enter Eq. 23 and 28, each (...) [m]: (rho_eff, rho_0)."""
         if self.mode == "shift":

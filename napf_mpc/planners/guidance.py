@@ -19,8 +19,9 @@ from napf_mpc.planners.guide_clearance import SolidBoxes, frame_of, solid_boxes
 from napf_mpc.planners.guide_search import plan_all, resample_all
 from napf_mpc.planners.guide_settings import FINE, GuidanceSettings, search_of
 from napf_mpc.planners.guide_traffic import TrafficPace, slowed
+from napf_mpc.planners.taut import pulled_taut
 from napf_mpc.problem import FormationMission, Problem
-from napf_mpc.safety_distance import Inflation, largest_sigma, rms_sigma
+from napf_mpc.safety_distance import Inflation, rms_sigma
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -50,6 +51,7 @@ class Guidance:
         self._frame = frame_of(self._path)
         self._slots = formation_offsets(problem.formation)
         self._lanes = np.ascontiguousarray(self._slots[:, 1:])
+        self._extra_m = problem.planner.contact_extra_m
         self._min_separation = problem.vehicle.min_separation_m
         self._traffic = TrafficPace(
             self._path, problem.mission.speed_mps, problem.vehicle.radius_m, inflation
@@ -70,6 +72,8 @@ class Guidance:
         self._obstacles = obstacles
         self._boxes: SolidBoxes = solid_boxes(obstacles, self._path)
         self._profiles = np.zeros((runs, uavs, stations, 2))
+        self._taut = np.zeros_like(self._profiles)
+        self._loose = np.ones((runs, uavs, stations))
         self._missing = np.zeros((runs, uavs, stations))
         self._busy = np.zeros(runs, dtype=bool)
         self._planned_at = np.zeros((runs, uavs))
@@ -124,7 +128,7 @@ class Guidance:
             self._plan(place, elapsed)
             self._last_s = time_s
             self._next_s = time_s + self.settings.period_s
-        guide = self._guide(along, self._from(along))
+        guide = self._guide(along, self._from(self._profiles, along), self._from(self._taut, along))
         if tracks is None or not tracks.count:
             return guide
         if due:
@@ -133,17 +137,17 @@ class Guidance:
             )
         return slowed(guide, self._traffic_pace)
 
-    def _from(self, along: Array) -> Array:
+    def _from(self, profiles: Array, along: Array) -> Array:
         """Profiles (run, uav, station, 2) as seen from along-track places (run, uav)."""
-        out = np.empty_like(self._profiles)
-        resample_all(self._profiles, along - self._planned_at, self._step_m, out)
+        out = np.empty_like(profiles)
+        resample_all(profiles, along - self._planned_at, self._step_m, out)
         return out
 
     def _plan(self, place: Array, elapsed_s: float) -> None:
         # Stations stand still in the world: a gap must not open and close with where the samples fall.
         step = self.settings.step_m
         along = np.floor(place[..., 0] / step) * step
-        last = self._from(along)
+        last = self._from(self._profiles, along)
         offset = np.ascontiguousarray(place[..., 1:]) - self._lanes
         margin = self._margin_covariance(elapsed_s)
         plan_all(
@@ -165,14 +169,15 @@ class Guidance:
             self._busy,
         )
         self._planned_at = along
+        self._taut, self._loose = pulled_taut(
+            self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
+            self._inflation.k, self._search.radius_m + self._extra_m, self.settings.taut_slope,
+        )  # fmt: skip
         self._hold(offset, elapsed_s)
 
     def _margin_covariance(self, elapsed_s: float) -> Array:
         """Covariance (run, uav, 3, 3) whose k sigma is the margin, as the inflation reads it."""
-        covariance = self._covariance
-        if self._inflation.reading in ("largest", "rms"):
-            one = largest_sigma(covariance) if self._inflation.reading == "largest" else rms_sigma(covariance)
-            covariance = np.asarray((one**2)[..., None, None] * np.eye(3))
+        covariance = self._inflation.margin_covariance(self._covariance)
         if self.settings.memory_s <= 0.0:
             return np.ascontiguousarray(covariance)
         sigma = np.sqrt(np.einsum("...ii->...i", covariance))
@@ -227,7 +232,7 @@ class Guidance:
         blocked = breach > tolerance_m[:, None, None]
         return np.asarray(np.where(blocked, self.ahead_m, np.inf).min((-1, -2)))
 
-    def _guide(self, along: Array, offset: Array) -> Guide:
+    def _guide(self, along: Array, offset: Array, taut: Array) -> Guide:
         settings = self.settings
         sigma = np.sqrt(np.maximum(np.einsum("ruab,a,b->ru", self._covariance, *[self._path.along] * 2), 0.0))
         error = synchronisation_error(along, self._slots[:, 0])
@@ -244,4 +249,4 @@ class Guidance:
         reason[self._holding] = Passage.HOLD
         reason[self._given_up] = Passage.NO_PASSAGE
         breach = np.maximum(self._missing.max(-1, initial=0.0) - settings.spare_m, 0.0)
-        return Guide(self.ahead_m, offset, pace, reason, breach)
+        return Guide(self.ahead_m, offset, pace, reason, breach, taut, self._loose)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -42,6 +42,29 @@ class Guide:
     """(run, uav) code of :class:`Passage`."""
     breach_m: Array
     """(run, uav) largest part of the margin r + k sigma that is missing on the way ahead; 0 for none [m]."""
+    taut: Array | None = None
+    """(run, uav, K, 2) the offset pulled taut, see :mod:`.taut`; by default as it is [m]."""
+    loose: Array | None = None
+    """(run, uav, K) part 0 to 1 of the way to the lane that is free, by default none."""
+
+    def on_lanes(self) -> Guide:
+        """The same pace along the lanes themselves."""
+        return replace(self, offset=np.zeros_like(self.offset))
+
+    def pulled(self) -> Guide:
+        """The same guide along its taut way, but for UAVs that hold: those have no other way on."""
+        if self.taut is None:
+            return self
+        holds = self.reason >= Passage.HOLD
+        return replace(self, offset=np.where(holds[..., None, None], self.offset, self.taut))
+
+    def loose_at(self, ahead_m: Array) -> Array:
+        """How loose the way is (run, uav, N) at distances ahead (run, uav, N) of UAVs that do not hold."""
+        if self.loose is None:
+            return np.zeros(ahead_m.shape)
+        index, _ = self._place(ahead_m)
+        loose = np.take_along_axis(self.loose, index, axis=2)
+        return np.where((self.reason >= Passage.HOLD)[..., None], 0.0, loose)
 
     def at(self, ahead_m: Array | float) -> Array:
         """Offsets at distances ahead, linear between the places and level beyond them [m].

@@ -28,7 +28,7 @@ from napf_mpc.planners.guide_clearance import (
     round_shortfall,
     shortfall,
 )
-from napf_mpc.planners.guide_lattice import Prices, bent, missing_price, steep
+from napf_mpc.planners.guide_lattice import Prices, bent, missing_price, steep, steep_limit
 
 Array = NDArray[np.float64]
 
@@ -132,7 +132,7 @@ def smooth_terms(profile: Array, mean: Array, last: Array, step_m: float, prices
     stations = profile.shape[0]
     bend = prices.bend / step_m**3
     flat = prices.slope / step_m
-    gentle = (prices.steep * step_m) ** 2
+    gentle = (min(prices.steep, prices.steep_far) * step_m) ** 2
     near = prices.far_m**2
     drawn = step_m * (prices.shape + prices.keep)
     for s in range(stations):
@@ -149,7 +149,7 @@ def smooth_terms(profile: Array, mean: Array, last: Array, step_m: float, prices
             rise = (profile[s, 0] - profile[s - 1, 0]) ** 2 + (profile[s, 1] - profile[s - 1, 1]) ** 2
             slope = flat
             if rise > gentle:
-                slope *= steep(math.sqrt(rise) / step_m, prices.steep)
+                slope *= steep(math.sqrt(rise) / step_m, steep_limit(profile[s, 0], prices))
             own[s, 0] += slope
             own[s - 1, 0] += slope
             one[s] -= slope
@@ -291,6 +291,7 @@ def band_price(
                     rise += (profiles[i, s, a] - profiles[i, s - 1, a]) ** 2
             total += step_m * (prices.path * bent(square, prices.far_m) + prices.shape * off)
             total += step_m * prices.keep * min(kept, prices.keep_m * prices.keep_m)
-            total += prices.slope * steep(np.sqrt(rise) / step_m, prices.steep) * rise / step_m
+            limit = steep_limit(profiles[i, s, 0], prices)
+            total += prices.slope * steep(np.sqrt(rise) / step_m, limit) * rise / step_m
             total += step_m * missing_price(missing[i, s], prices)
     return total

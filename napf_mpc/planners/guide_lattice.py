@@ -61,7 +61,8 @@ class Prices(NamedTuple):
     shape: float  # squared offset from the others' mean offset [1/m^2]
     far_m: float  # beyond this, offsets cost linearly: a long way round beats a squeeze
     slope: float  # squared slope
-    steep: float  # slope from which that price rises with its fourth power
+    steep: float  # slope from which that price rises with its fourth power,
+    steep_far: float  # and to offsets aside of more than far_m
     bend: float  # squared change of slope [m^2]
     keep: float  # squared difference to the last profile [1/m^2], up to keep_m
     keep_m: float
@@ -87,6 +88,12 @@ def steep(slope: float, limit: float) -> float:
     """Factor on the price of a slope: 1 up to a limit, beyond it the fourth power of the ratio."""
     square = max(1.0, slope / limit) ** 2
     return square * square
+
+
+@compiled
+def steep_limit(left_m: float, prices: Prices) -> float:
+    """Slope from which slopes cost more on the way to an offset."""
+    return prices.steep_far if abs(left_m) > prices.far_m else prices.steep
 
 
 @compiled
@@ -354,13 +361,23 @@ def _apart_price(
 
 
 @compiled
-def _edge_prices(lattice: Lattice, slope_price: float, steep_slope: float, edge: Array) -> None:
-    """Prices (3, 2) of steps of so many cells and layers from one station to the next."""
-    for dc in range(3):
-        for dv in range(2):
-            square = (dc * lattice.cell_m) ** 2 + (dv * lattice.layer_m) ** 2
-            factor = steep(math.sqrt(square) / lattice.step_m, steep_slope)
-            edge[dc, dv] = slope_price * factor * square / lattice.step_m
+def edge_prices(lattice: Lattice, prices: Prices, weight: float, edge: Array) -> None:
+    """Prices (2, 3, 2) of steps of so many cells and layers from one station to the next.
+
+    First to places near the lane, second to those far aside of it, see :func:`steep_limit`.
+    """
+    for far in range(2):
+        for dc in range(3):
+            for dv in range(2):
+                square = (dc * lattice.cell_m) ** 2 + (dv * lattice.layer_m) ** 2
+                limit = prices.steep_far if far else prices.steep
+                factor = steep(math.sqrt(square) / lattice.step_m, limit)
+                edge[far, dc, dv] = weight * prices.slope * factor * square / lattice.step_m
+
+
+@compiled
+def _is_far(c: int, lattice: Lattice, prices: Prices) -> int:
+    return 1 if abs(c - lattice.half) * lattice.cell_m > prices.far_m else 0
 
 
 @compiled
@@ -392,7 +409,7 @@ def price_of(
             dv = min(max(min(max(to_v, 0), layers - 1) - v, -1), 1)
             c += dc
             v += dv
-            total += edge[abs(dc), abs(dv)]
+            total += edge[_is_far(c, lattice, prices), abs(dc), abs(dv)]
         keep = prices.keep * (1.0 - s / lattice.stations)
         left = (c - lattice.half) * lattice.cell_m
         up = (v - below) * lattice.layer_m
@@ -609,6 +626,8 @@ def search_within(
     weight = float(query.stop - query.first)
     value = bench.value
     window = (start_layer, start_layer, start_cell, start_cell)
+    near = int(np.floor(prices.far_m / lattice.cell_m))
+    first, last = max(0, lattice.half - near), min(cells - 1, lattice.half + near)
     if query.aside >= 0.0:
         window = (lowest, highest, 0, cells - 1)
     for s in range(lattice.stations):
@@ -621,7 +640,11 @@ def search_within(
         least = weight * (lattice.step_m * prices.path + bench.ahead[s])
         for v in range(window[0], window[1] + 1):
             if s > 0:
-                _relax(value, bench.bend, s, v, window[2], window[3], edge, least, limit)
+                # Near the lane, and far aside of it on both sides.
+                for far, c0, c1 in ((1, 0, first - 1), (0, first, last), (1, last + 1, cells - 1)):
+                    low, high = max(window[2], c0), min(window[3], c1)
+                    if low <= high:
+                        _relax(value, bench.bend, s, v, low, high, edge[far], least, limit)
             else:
                 value[0, LAYER_HALO + v, HALO + window[2] : HALO + window[3] + 1] = 0.0
         window = _pay(
@@ -644,7 +667,7 @@ def search_within(
                 c_end = c
                 v_end = v
     if best < np.inf:
-        _trace(value, lattice, below, edge, c_end, v_end, profile)
+        _trace(value, lattice, prices, below, edge, c_end, v_end, profile)
     return best
 
 
@@ -662,7 +685,14 @@ def _clear(value: Array, s: int, window: tuple[int, int, int, int]) -> None:
 
 @compiled
 def _trace(
-    value: Array, lattice: Lattice, below: int, edge: Array, cell: int, layer: int, profile: Array
+    value: Array,
+    lattice: Lattice,
+    prices: Prices,
+    below: int,
+    edge: Array,
+    cell: int,
+    layer: int,
+    profile: Array,
 ) -> None:
     """Write the profile that ends in a place: back from station to station the way that was cheapest."""
     c = cell
@@ -672,12 +702,13 @@ def _trace(
         profile[s, 1] = (v - below) * lattice.layer_m
         if s == 0:
             return
+        far = _is_far(c, lattice, prices)
         best = np.inf
         from_c = c
         from_v = v
         for dc in range(-2, 3):
             for dv in range(-1, 2):
-                price = value[s - 1, LAYER_HALO + v - dv, HALO + c - dc] + edge[abs(dc), abs(dv)]
+                price = value[s - 1, LAYER_HALO + v - dv, HALO + c - dc] + edge[far, abs(dc), abs(dv)]
                 if price < best:
                     best = price
                     from_c = c - dc
@@ -705,8 +736,8 @@ def cheapest_profile(
     weight = float(query.stop - query.first)
     c = min(max(round(offset[0] / lattice.cell_m) + lattice.half, 0), 2 * lattice.half)
     v = min(max(round(offset[1] / lattice.layer_m) + below, 0), layers - 1)
-    edge = np.empty((3, 2))
-    _edge_prices(lattice, weight * prices.slope, prices.steep, edge)
+    edge = np.empty((2, 3, 2))
+    edge_prices(lattice, prices, weight, edge)
     # What was flown last is a way as well, or near to one.
     wanted = query.last[query.first] if query.stop - query.first == 1 else query.mean
     known = price_of(sight, lattice, below, layers, prices, query, bench.bend, edge, c, v, wanted)

@@ -33,7 +33,7 @@ class GuidanceSettings:
     """Layers to pass spheres, half of them up and half down."""
     wide_m: float = 6.0
     """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
-    path: float = 3.5
+    path: float = 4.8
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
     shape: float = 9.0
     """Price of a squared difference to the mean of all offsets [1/m^2 per metre]."""
@@ -41,8 +41,11 @@ class GuidanceSettings:
     """Offsets beyond this are priced linearly [m]."""
     slope: float = 6.0
     """Price of a squared slope [per metre]."""
-    steep: float = 0.3
-    """Slope from which that price rises with the slope's fourth power."""
+    steep: float = 0.7
+    """Slope from which that price rises with the slope's fourth power, ..."""
+    steep_far: float = 0.25
+    """... and the same for offsets aside beyond ``far_m``. Far out every metre is dear, so a wide detour would
+    be left for last, at the steepest slope there is, and then be too late; so it is planned gently."""
     bend: float = 10.0
     """Price of a squared change of slope per metre [m^2 per metre]."""
     keep: float = 1.0
@@ -67,6 +70,8 @@ class GuidanceSettings:
     """Largest step of a pass [m]."""
     shared_gain: float = 0.9
     """One way for all is taken if it costs less than this share of individual ways."""
+    taut_slope: float = 0.35
+    """Slope at which a way that was pulled taut leads back to where it must be kept."""
     flown_slope: float = 1.4
     """Slope that is flown at full pace."""
     bend_m: float = 6.0
@@ -121,6 +126,7 @@ def _prices(settings: GuidanceSettings, scale: int) -> Prices:
         settings.far_m * scale,
         settings.slope * scale**2,
         settings.steep,
+        settings.steep_far,
         settings.bend * scale**4,
         settings.keep,
         settings.keep_m,

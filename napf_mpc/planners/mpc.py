@@ -19,8 +19,11 @@ from napf_mpc.formation import PathFrame
 from napf_mpc.jit import compiled
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
+from napf_mpc.planners.cohesion import drawn_together
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
+from napf_mpc.planners.guess import cut_at_obstacles
 from napf_mpc.planners.guidance import Guidance
+from napf_mpc.planners.guide import Guide
 from napf_mpc.planners.guided_field import waiting_reasons
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
 from napf_mpc.planners.planner import Command, Reason
@@ -134,7 +137,8 @@ class QpPlanner:
         self._frame = PathFrame.of_mission(problem.mission)
         self._slots = SlotReference.of_problem(problem, problem.mission)
         follows = settings.guidance == "blended" if guided is None else guided
-        self._guidance = Guidance(problem, Inflation.of_problem(problem)) if follows else None
+        self._inflation = Inflation.of_problem(problem)
+        self._guidance = Guidance(problem, self._inflation) if follows else None
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
         self._period_s = 1.0 / settings.rate_hz
         step = stage_grid(self._period_s, settings.horizon, settings.look_ahead_s)
@@ -173,8 +177,9 @@ class QpPlanner:
         """Programs of this step, in coordinates whose origin is each UAV's reported position."""
         trusted = nav.trusted()
         state = self._state(nav, trusted)
-        reference = self._slots.over(state[..., POSITION], self._model.times_s, self._sigma(nav, trusted))
-        guess, _ = self._guess(state, reference, time_s)
+        carried = self._carried(state, time_s)
+        reference, way = self._references(state, carried, nav, trusted, None)
+        guess, _ = self._guess(state, way, carried, time_s)
         return self._programs(state, reference, self._horizon(guess, nav, trusted, time_s))
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
@@ -188,11 +193,10 @@ class QpPlanner:
         guide = None
         if self._guidance is not None:
             guide = self._guidance.step(state[..., POSITION], covariance, trusted, time_s)
-        reference = self._slots.over(
-            state[..., POSITION], self._model.times_s, self._sigma(nav, trusted), guide
-        )
+        carried = self._carried(state, time_s)
+        reference, way = self._references(state, carried, nav, trusted, guide)
         began = 0.0 if self._clock is None else self._clock()
-        answer = self._solve(state, reference, nav, trusted, time_s)
+        answer = self._solve(state, reference, self._guess(state, way, carried, time_s), nav, trusted, time_s)
         late = self._clock is not None and not self._clock() - began <= self._period_s
         refused = refusals(answer, self._limits)
         upset = np.abs(state[..., 6:10:2]).max(-1) > UPSET_RAD
@@ -245,21 +249,58 @@ class QpPlanner:
         known[..., 6:12:2], known[..., 7:12:2] = nav.attitude, nav.body_rates
         return np.where(trusted[..., None], known, state)
 
-    def _guess(self, state: Array, reference: Array, time_s: float) -> tuple[Array, Array]:
+    def _carried(self, state: Array, time_s: float) -> tuple[Array, Array] | None:
         """States and inputs of the last plans on this step's grid, moved to where navigation is now."""
-        plan, step_s = self._plan, self._model.step_s
-        if plan is None:
-            velocity = reference[:, :, 0, VELOCITY]
+        if self._plan is None:
+            return None
+        states, inputs = self._plan.resampled(time_s, self._model.step_s)
+        states[..., POSITION] += (state - self._plan.at(time_s)[0])[:, :, None, POSITION]
+        return states, inputs
+
+    def _references(
+        self,
+        state: Array,
+        carried: tuple[Array, Array] | None,
+        nav: NavSolution,
+        trusted: Mask,
+        guide: Guide | None,
+    ) -> tuple[Array, Array]:
+        """States (run, uav, N, 12) to track, and of the way that guidance has found."""
+        place, times, sigma = state[..., POSITION], self._model.times_s, self._sigma(nav, trusted)
+        share: Array | float = self.problem.planner.cohesion
+        if guide is None:
+            free = reference = way = self._slots.over(place, times, sigma)
+        else:
+            free = self._slots.over(place, times, sigma, guide.on_lanes())
+            reference = way = self._slots.over(place, times, sigma, guide)
+            # Raw measurements jump by more than what a taut way could gain.
+            share = 0.0
+            if nav.filtered:
+                reference = self._slots.over(place, times, sigma, guide.pulled())
+                along = self._frame.along_track
+                ahead = along(free[..., POSITION]) - along(place)[..., None]
+                share = self.problem.planner.cohesion * guide.loose_at(ahead)
+        if carried is not None and len(self._lanes) > 1:
+            reference = drawn_together(reference, free, carried[0], trusted, share, self._frame)
+        return reference, way
+
+    def _guess(
+        self, state: Array, way: Array, carried: tuple[Array, Array] | None, time_s: float
+    ) -> tuple[Array, Array]:
+        """States and inputs at which rows are linear: last plans, or the guide's way for what is stuck."""
+        step_s = self._model.step_s
+        if carried is None:
+            velocity = way[:, :, 0, VELOCITY]
             plan = straight_plan(self.problem.vehicle, self._yaw, time_s, step_s, state, velocity)
-        states, inputs = plan.resampled(time_s, step_s)
-        states[..., POSITION] += (state - plan.at(time_s)[0])[:, :, None, POSITION]
+            carried = plan.resampled(time_s, step_s)
+        states, inputs = carried
         if self._guidance is not None:
             # Rows made at a plan that stands before an obstacle hold it there: the guide's way leads past.
             now = self._frame.along_track(state[..., POSITION])
-            asked = self._frame.along_track(reference[:, :, -1, POSITION]) - now
+            asked = self._frame.along_track(way[:, :, -1, POSITION]) - now
             planned = self._frame.along_track(states[:, :, -1, POSITION]) - now
             stuck = (asked > STUCK_M) & (planned < STUCK_PART * asked)
-            states = np.where(stuck[..., None, None], reference, states)
+            states = np.where(stuck[..., None, None], way, states)
         return states, inputs
 
     def _horizon(self, guess: Array, nav: NavSolution, trusted: Mask, time_s: float) -> Horizon:
@@ -267,7 +308,7 @@ class QpPlanner:
         return Horizon(
             time_s=time_s,
             step_s=self._model.step_s,
-            position=np.ascontiguousarray(guess[..., POSITION]),
+            position=cut_at_obstacles(guess[..., POSITION], self._obstacles),
             velocity=np.ascontiguousarray(guess[..., VELOCITY]),
             covariance=np.where(known[..., None], self._covariance(nav), np.eye(3)),
             common_factor=np.where(known, nav.common_factor, 0.0),
@@ -294,10 +335,16 @@ class QpPlanner:
         return HorizonQp(self._model, _moved(state, -origin), _moved(reference, -origin), tuple(blocks))
 
     def _solve(
-        self, state: Array, reference: Array, nav: NavSolution, trusted: Mask, time_s: float
+        self,
+        state: Array,
+        reference: Array,
+        guess: tuple[Array, Array],
+        nav: NavSolution,
+        trusted: Mask,
+        time_s: float,
     ) -> BatchResult:
         """Answers in the world's coordinates, after as many passes as the problem asks for."""
-        states, inputs = self._guess(state, reference, time_s)
+        states, inputs = guess
         origin, answer = np.ascontiguousarray(state[..., POSITION]), self._answer
         asked: Mask = np.asarray(trusted.any(-1))
         for turn in range(self.problem.planner.passes):

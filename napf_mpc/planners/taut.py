@@ -1,0 +1,153 @@
+"""Pulling a guide's way taut: as near to the lane as the margins of the obstacles let it come.
+
+Guidance finds on which side to pass, with room to spare and on a coarse lattice; a UAV that follows it to the
+letter flies farther out, and longer, than it has to. What the guide is needed for is the side. So each place
+of the way is drawn straight towards the lane, up to the first place that is short of the margin: what lies
+beyond an obstacle, or beyond a gap that is too narrow, is not reached, since a margin lies between. And a
+place is drawn away from the way only so far that it leads back to it, at a slope that can be flown, where the
+way must be kept: nobody flies into a dead end because its mouth is wide.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.constraints.probability import sigma_along
+from napf_mpc.jit import compiled
+from napf_mpc.planners.guide_clearance import Frame
+from napf_mpc.world.bounding_tree import STACK, BoxTree
+from napf_mpc.world.distance import Solids
+from napf_mpc.world.obstacles import ObstacleSet
+from napf_mpc.world.queries import nearest_obstacle
+
+Array = NDArray[np.float64]
+
+STEPS = 5
+"""Places looked at between the guide's way and the lane."""
+SAME_M = 0.01
+"""Offsets below this are none."""
+
+
+def pulled_taut(
+    profiles: Array,
+    along: Array,
+    step_m: float,
+    lanes: Array,
+    frame: Frame,
+    obstacles: ObstacleSet,
+    covariance: Array,
+    k: float,
+    radius_m: float,
+    slope: float,
+) -> tuple[Array, Array]:
+    """Offsets as near to the lanes as the margins allow, and how loose they are.
+
+    Parameters
+    ----------
+    profiles : array, shape (run, uav, station, 2)
+        Offsets from the lanes, left and up [m].
+    along : array, shape (run, uav)
+        Where the profiles start on the path [m].
+    step_m : float
+        From station to station [m].
+    lanes : array, shape (uav, 2)
+        Left and up [m].
+    frame : Frame
+        The path's frame.
+    obstacles : ObstacleSet
+        The map.
+    covariance : array, shape (run, uav, 3, 3)
+        Of the position, whose k sigma is the margin [m^2].
+    k : float
+        Sigmas.
+    radius_m : float
+        Of a UAV [m].
+    slope : float
+        At which a place leads back to the way, per metre of path.
+
+    Returns
+    -------
+    offsets : array, shape (run, uav, station, 2)
+        [m].
+    loose : array, shape (run, uav, station)
+        Part of the way to the lane that was gone: 1 where nothing is in between.
+    """
+    out = profiles.copy()
+    loose = np.ones(profiles.shape[:3])
+    _pull(
+        obstacles.solids, obstacles.tree, obstacles.scene_start, along, step_m, lanes, frame, covariance, k,
+        radius_m, slope * step_m, out, loose,
+    )  # fmt: skip
+    return out, loose
+
+
+@compiled
+def _pull(
+    solids: Solids,
+    tree: BoxTree,
+    scene_start: NDArray[np.int64],
+    along: Array,
+    step_m: float,
+    lanes: Array,
+    frame: Frame,
+    covariance: Array,
+    k: float,
+    radius_m: float,
+    most: float,
+    out: Array,
+    loose: Array,
+) -> None:
+    """Pull out (run, uav, station, 2) taut in place; ``most`` is slope times the stations' distance [m]."""
+    runs, uavs, stations = out.shape[:3]
+    nodes, bounds = np.empty(STACK, dtype=np.int64), np.empty(STACK)
+    for run in range(runs):
+        scene = 0 if len(scene_start) == 2 else run
+        for uav in range(uavs):
+            c = covariance[run, uav]
+            ahead = 0.0
+            for s in range(stations - 1, -1, -1):
+                left, up = out[run, uav, s]
+                size = math.sqrt(left * left + up * up)
+                # Backwards: from here, what lies ahead has to be reached at no more than the slope.
+                limit = size - (ahead - most)
+                pulled = 0.0
+                ahead = size
+                if size < SAME_M or limit <= 0.0:
+                    loose[run, uav, s] = 1.0 if size < SAME_M else 0.0
+                    continue
+                for step in range(1, STEPS + 1):
+                    want = min(size * step / STEPS, limit)
+                    kept = 1.0 - want / size
+                    place = along[run, uav] + s * step_m
+                    y, z = lanes[uav, 0] + kept * left, lanes[uav, 1] + kept * up
+                    px = (
+                        frame.origin[0]
+                        + place * frame.axes[0, 0]
+                        + y * frame.axes[1, 0]
+                        + z * frame.axes[2, 0]
+                    )
+                    py = (
+                        frame.origin[1]
+                        + place * frame.axes[0, 1]
+                        + y * frame.axes[1, 1]
+                        + z * frame.axes[2, 1]
+                    )
+                    pz = (
+                        frame.origin[2]
+                        + place * frame.axes[0, 2]
+                        + y * frame.axes[1, 2]
+                        + z * frame.axes[2, 2]
+                    )
+                    d, gx, gy, gz, _ = nearest_obstacle(solids, tree, scene, px, py, pz, nodes, bounds)
+                    if radius_m + k * sigma_along(c, gx, gy, gz) > d:
+                        break
+                    pulled = want
+                    if want == limit:
+                        break
+                ahead = size - pulled
+                loose[run, uav, s] = pulled / size
+                out[run, uav, s, 0] = left * (1.0 - pulled / size)
+                out[run, uav, s, 1] = up * (1.0 - pulled / size)
