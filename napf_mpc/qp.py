@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from napf_mpc.constraints.constraint import SIGNALS, ConstraintError, LinearRows
+from napf_mpc.jit import compiled
 from napf_mpc.quadratic_program import (
     Array,
     Index,
@@ -24,6 +25,7 @@ from napf_mpc.quadratic_program import (
     Sparsity,
     Values,
 )
+from napf_mpc.vehicle.plant import plain
 
 __all__ = [
     "INPUTS",
@@ -274,39 +276,45 @@ class Layout:
         runs, uavs, stages = horizon.shape
         model, batch = horizon.model, (runs, uavs)
         at_a, at_b, at_q, at_r = self.places
-        p, a = [model.q[at_q], model.r[at_r]], [np.ones(STATES * stages), -model.a[1:][at_a], -model.b[at_b]]
-        p, a = ([np.broadcast_to(v, (*batch, v.size)) for v in values] for values in (p, a))
-        pull = np.zeros((*batch, stages, STATES))
-        start = np.zeros((*batch, stages, STATES))
-        # One state after the other: a library product may group its terms by the length of the batch.
-        for j in range(STATES):
-            pull -= model.q[:, :, j] * horizon.reference[..., j, None]
-            start[:, :, 0] += model.a[0, :, j] * horizon.initial[..., j, None]
-        q = [_flat(pull), np.zeros((*batch, INPUTS * stages))]
-        lower, upper = [_flat(start)], [_flat(start)]
+        n, m = self.sparsity.variables, self.sparsity.constraints
+        p, a = _Line(batch, len(self.p_order)), _Line(batch, len(self.a_order))
+        q, lower, upper = _Line(batch, n), _Line(batch, m), _Line(batch, m)
+        pull, start = np.zeros((*batch, stages, STATES)), np.zeros((*batch, stages, STATES))
+        _add_pull_and_start(
+            plain(model.q), plain(model.a), plain(horizon.reference), plain(horizon.initial), pull, start
+        )
+        p.add(model.q[at_q])
+        p.add(model.r[at_r])
+        q.add(_flat(pull))
+        q.repeat(0.0, INPUTS * stages)
+        a.repeat(1.0, STATES * stages)
+        a.add(-model.a[1:][at_a])
+        a.add(-model.b[at_b])
+        lower.add(_flat(start))
+        upper.add(_flat(start))
         duration = model.step_s[:, None]
         for block in horizon.rows:
-            jac = _flat(block.jac)
+            jac, rows = _flat(block.jac), stages * block.count
             for low, high, sign in _sides(block):
-                a.append(jac)
+                a.add(jac)
                 if block.soft:
-                    a.append(np.full((*batch, stages * block.count), sign))
-                lower.append(_bound(low, -np.inf, block))
-                upper.append(_bound(high, np.inf, block))
+                    a.repeat(sign, rows)
+                for line, values, missing in ((lower, low, -np.inf), (upper, high, np.inf)):
+                    if values is None:
+                        line.repeat(missing, rows)
+                    else:
+                        line.add(_flat(values))
             if block.w1 is not None and block.w2 is not None:
                 size = block.slack_count * stages
-                p.append(_flat(block.w2 * duration))
-                q.append(_flat(block.w1 * duration))
-                a.append(np.ones((*batch, size)))
-                lower.append(np.zeros((*batch, size)))
-                upper.append(np.full((*batch, size), np.inf))
+                p.add(_flat(block.w2 * duration))
+                q.add(_flat(block.w1 * duration))
+                a.repeat(1.0, size)
+                lower.repeat(0.0, size)
+                upper.repeat(np.inf, size)
         return Values(
-            np.concatenate(p, axis=-1)[..., self.p_order],
-            np.concatenate(q, axis=-1),
-            np.concatenate(a, axis=-1)[..., self.a_order],
-            np.concatenate(lower, axis=-1),
-            np.concatenate(upper, axis=-1),
-        )
+            _ordered(p.values, self.p_order), q.values, _ordered(a.values, self.a_order),
+            lower.values, upper.values,
+        )  # fmt: skip
 
     def states(self, z: Array) -> Array:
         """States (..., N, 12) of primal points (..., n)."""
@@ -342,6 +350,58 @@ def _flat(values: Array) -> Array:
     return values.reshape(*values.shape[:2], math.prod(values.shape[2:]))
 
 
+class _Line:
+    """Numbers (run, uav, k) of all programs, filled from left to right."""
+
+    def __init__(self, batch: tuple[int, int], size: int) -> None:
+        self.values = np.empty((*batch, size))
+        self._end = 0
+
+    def add(self, values: Array) -> None:
+        """Go on with numbers (run, uav, k), or (k,) of all programs."""
+        begin, self._end = self._end, self._end + values.shape[-1]
+        self.values[..., begin : self._end] = values
+
+    def repeat(self, value: float, count: int) -> None:
+        """Go on with a number again and again."""
+        begin, self._end = self._end, self._end + count
+        self.values[..., begin : self._end] = value
+
+
+@compiled
+def _add_pull_and_start(
+    q: Array, a: Array, reference: Array, initial: Array, pull: Array, start: Array
+) -> None:
+    """Subtract Q times the references (run, uav, N, 12) from pull; add A x_0 to the first stage of start.
+
+    One state after the other: a library product may group its terms by the length of the batch.
+    """
+    for run in range(pull.shape[0]):
+        for uav in range(pull.shape[1]):
+            for k in range(pull.shape[2]):
+                for i in range(STATES):
+                    for j in range(STATES):
+                        pull[run, uav, k, i] -= q[k, i, j] * reference[run, uav, k, j]
+            for i in range(STATES):
+                for j in range(STATES):
+                    start[run, uav, 0, i] += a[0, i, j] * initial[run, uav, j]
+
+
+def _ordered(values: Array, order: Index) -> Array:
+    """Numbers (run, uav, k) brought into another order, the same for all."""
+    out = np.empty(values.shape)
+    _take(values, order, out)
+    return out
+
+
+@compiled
+def _take(values: Array, order: Index, out: Array) -> None:
+    for run in range(out.shape[0]):
+        for uav in range(out.shape[1]):
+            for k in range(len(order)):
+                out[run, uav, k] = values[run, uav, order[k]]
+
+
 def _sides(block: LinearRows) -> list[tuple[Array | None, Array | None, float]]:
     """Bounds of each copy of a block's rows in A, and the sign of the slack in it."""
     if not block.soft:
@@ -352,7 +412,3 @@ def _sides(block: LinearRows) -> list[tuple[Array | None, Array | None, float]]:
     if block.upper is not None:
         sides.append((None, block.upper, -1.0))
     return sides
-
-
-def _bound(values: Array | None, missing: float, block: LinearRows) -> Array:
-    return _flat(np.full(block.jac.shape[:4], missing) if values is None else values)

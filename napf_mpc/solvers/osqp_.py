@@ -7,10 +7,15 @@ force on the row moves it while the equality rows (the dynamics) hold, which dep
 computed once. And rows that the guess finds pushing weigh more. After each round of iterations all rows are
 weighed anew, as the last round now is the guess. OSQP's own scaling and adaptive rho know none of this and
 stay off, so that nothing but the guess carries over from one program to the next.
+
+Slacks that the guess has at zero are left out first (see :mod:`napf_mpc.solvers.presolve`): most programs
+then are a third smaller. An answer that does not hold for the whole program costs at most :data:`HARD`
+iterations, and the whole one is solved.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,31 +26,37 @@ from scipy.sparse.linalg import splu
 
 from napf_mpc.jit import compiled
 from napf_mpc.quadratic_program import Array, Index, QpStatus, Sparsity, Values
+from napf_mpc.solvers.presolve import Part, Slacks
 from napf_mpc.solvers.solver import Answer, MakeBackend, Warm
 
 DEFAULTS: dict[str, Any] = {
     "eps_abs": 1e-5,
     "eps_rel": 0.0,
     "polishing": True,
-    "alpha": 1.4,
-    "check_termination": 5,
+    "alpha": 1.2,
+    "check_termination": 3,
     "max_iter": 1000,
 }
 """Over-relaxation leaves a stiff row ``alpha - 1`` of its last error: OSQP's own 1.6 is slow here."""
 OURS: dict[str, Any] = {"scaling": 0, "verbose": False, "rho": 1.0, "adaptive_rho": 0}
 """Settings that are not to choose."""
-COARSE, EXACT = 3e-4, 1e-7
+COARSE, EXACT = 1e-2, 1e-7
 """ADMM need only find the active rows, polishing then solves them exactly: a first try stops at a residual of
 COARSE, and iterations go on to the tolerance only if polishing it leaves more than EXACT (scaled)."""
-ROUND, LONGER = 15, 1.5
+ROUND, LONGER = 10, 1.5
 """Iterations of a round, and how much longer those of each cycle are than of the one before."""
-EQUAL, LOOSE, PUSHING = 10.0, 0.07, 50.0
+EQUAL, LOOSE, PUSHING = 100.0, 0.015, 100.0
 """Weight times compliance of an equality row and of a row that does not push, and what one that pushes gets
 on top. (OSQP itself puts 1000 on top of equality rows.)"""
-STEEPER, CYCLE = 8.0, 6
+STEEPER, CYCLE = 6.0, 8
 """How much more pushing and equality rows get each round, and rounds until that starts again. Where rows
 contradict each other, multipliers climb to the price of a slack at the pace of the softest row among them,
 the dynamics included; rows that come and go need little."""
+HARD = 60
+"""Iterations at most without the slacks that are expected at zero; most programs take nine."""
+OFF, FAR = 1e-6, 1e20
+"""Weight times compliance of a row without bounds, and the bound that OSQP is told instead (scaled): it would
+factorise once more in each program in which a row loses or regains all its bounds."""
 FREE = 1e4
 """Largest compliance: that of a variable or row without a cost of its own."""
 STIFF = 1e-4
@@ -102,13 +113,12 @@ class Compliances:
         own : array, shape (n,)
             The same without any rows.
         """
-        equal = values.lower == values.upper
-        known = self._sparsity is sparsity and np.array_equal(equal, self._equal)
-        if known:
-            p, a = values.p[self._p_inner], values.a[self._a_inner]
-            known = np.array_equal(p, self._p) and np.array_equal(a, self._a)
+        known = self._sparsity is sparsity and _same_model(
+            values.p, values.a, values.lower, values.upper,
+            self._equal, self._p_inner, self._p, self._a_inner, self._a,
+        )  # fmt: skip
         if not known:
-            self._learn(sparsity, values, equal, own)
+            self._learn(sparsity, values, values.lower == values.upper, own)
         return np.where(self._inner, self._held, own)
 
     def _learn(self, sparsity: Sparsity, values: Values, equal: NDArray[np.bool_], own: Array) -> None:
@@ -141,15 +151,33 @@ class Compliances:
         self._held[self._inner] = factors.solve(np.eye(count + rows, count))[:count].diagonal()
 
 
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    """What OSQP said of a part of a program."""
+
+    name: str
+    """Its status by name."""
+    said: str
+    """The same in its words."""
+    exact: bool
+    """Whether polishing left an exact answer; what was not to be polished counts as exact."""
+    z: Array
+    """(n') point of the part, in the program's own measure."""
+    y: Array
+    """(m') multipliers."""
+    iterations: int
+    """Of all rounds."""
+
+
 class OsqpBackend:
-    """One OSQP object for programs of one sparsity."""
+    """OSQP objects for programs of one sparsity: with all slacks, and without those expected at zero."""
 
     def __init__(self, sparsity: Sparsity, settings: dict[str, Any], compliances: Compliances) -> None:
         self._sparsity, self._settings, self._compliances = sparsity, settings, compliances
-        self._upper = np.flatnonzero(sparsity.p_rows <= sparsity.p_columns)
-        self._p_rows, self._p_columns = sparsity.p_rows[self._upper], sparsity.p_columns[self._upper]
         self._diagonal = np.flatnonzero(sparsity.p_rows == sparsity.p_columns)
-        self._solver: Any = None
+        self._slacks: Slacks | None = None
+        self._most: _Workspace | None = None
+        self._hard: _Workspace | None = None
 
     def solve(self, values: Values, warm: Warm | None) -> Answer:
         """Solve the numbers from a guess, or from zero.
@@ -159,20 +187,73 @@ class OsqpBackend:
         KeyboardInterrupt
             OSQP takes the interrupt for itself; this hands it on.
         """
-        places, settings = self._sparsity, self._settings
-        own = np.full(places.variables, FREE)
-        own[places.p_rows[self._diagonal]] = 1.0 / np.maximum(values.p[self._diagonal], 1.0 / FREE)
+        places, limit, used = self._sparsity, int(self._settings["max_iter"]), 0
+        slacks = self._fitting_slacks(values)
+        own = _free_compliances(values.p, places.p_rows, self._diagonal, places.variables)
         held = self._compliances.of(places, values, own)
-        d = np.sqrt(own)
-        p, q = values.p[self._upper] * d[self._p_rows] * d[self._p_columns], values.q * d
         # Without a guess it would start from where the last solve ended, even if that was far out.
         z, y = (np.zeros(places.variables), np.zeros(places.constraints)) if warm is None else warm
-        coarse = bool(settings["polishing"]) and settings["eps_abs"] < COARSE
-        most, used, turn = int(settings["max_iter"]), 0, 0
+        few = min(HARD, limit // 2)
+        if warm is not None and few > 0 and slacks.hard is not None and slacks.expected_at_zero(values, z):
+            self._hard = self._hard or _Workspace(slacks.hard, self._settings)
+            outcome = self._hard.solve(values, own, held, *slacks.hard.guess(z, y), few)
+            used = outcome.iterations
+            if outcome.name == "OSQP_SOLVED" and outcome.exact:
+                point, multipliers, paid = slacks.whole(slacks.hard, values, outcome.z, outcome.y)
+                if paid:
+                    return Answer(QpStatus.SOLVED, point, multipliers, used)
+            elif outcome.name not in (*_UNFINISHED, "OSQP_SOLVED"):
+                # Without slacks there may be no point at all, and what OSQP then holds may be no numbers.
+                self._hard = None
+        self._most = self._most or _Workspace(slacks.most, self._settings)
+        outcome = self._most.solve(values, own, held, *slacks.most.guess(z, y), limit - used)
+        point, multipliers, _ = slacks.whole(slacks.most, values, outcome.z, outcome.y)
+        status = _STATUS.get(outcome.name, QpStatus.FAILED)
+        message = "" if status is QpStatus.SOLVED else f"osqp: {outcome.said}"
+        return Answer(status, point, multipliers, used + outcome.iterations, message)
+
+    def _fitting_slacks(self, values: Values) -> Slacks:
+        if self._slacks is None or not self._slacks.fit(values):
+            before = None if self._slacks is None else self._slacks.priced
+            self._slacks = Slacks.of(self._sparsity, values, before)
+            self._most = self._hard = None
+        return self._slacks
+
+
+class _Workspace:
+    """One OSQP object, for a part of programs."""
+
+    def __init__(self, part: Part, settings: dict[str, Any]) -> None:
+        self._part, self._settings = part, settings
+        self._solver: Any = None
+        self._limits: tuple[object, ...] = ()
+
+    def solve(self, values: Values, own: Array, held: Array, z: Array, y: Array, most: int) -> _Outcome:
+        """Solve the part of a program's numbers from a guess.
+
+        Parameters
+        ----------
+        values : Values
+            Of the whole program.
+        own, held : array, shape (n,)
+            Compliances of the whole program's variables, free and while the equality rows hold.
+        z, y : array, shapes (n') and (m')
+            Guess of the part; y is written to.
+        most : int
+            Iterations at most, > 0.
+        """
+        part, places, settings = self._part, self._part.sparsity, self._settings
+        p, q, entries, low, high, own, held, d = _taken(
+            values.p, values.q, values.a, values.lower, values.upper, own, held,
+            part.p_at, places.p_rows, places.p_columns, part.columns, part.a_at, part.rows, part.above,
+        )  # fmt: skip
+        polishing = bool(settings["polishing"])
+        coarse, exact = polishing and settings["eps_abs"] < COARSE, not polishing
+        used, turn = 0, 0
         while True:
             steeper = STEEPER ** (turn % CYCLE)
             e, a, lower, upper = _weighed(
-                values.a, places.a_rows, places.a_columns, values.lower, values.upper, own, held, d, z, y,
+                entries, places.a_rows, places.a_columns, low, high, own, held, d, z, y,
                 EQUAL * steeper, LOOSE, PUSHING * steeper,
             )  # fmt: skip
             if self._solver is None:
@@ -182,40 +263,91 @@ class OsqpBackend:
             else:
                 self._solver.update(q=q, l=lower, u=upper, Px=p, Ax=a)
             self._solver.warm_start(x=z / d, y=np.append(y, 0.0) / e)
-            self._solver.update_settings(
-                max_iter=min(int(ROUND * LONGER ** (turn // CYCLE)), most - used),
-                eps_abs=COARSE if coarse else settings["eps_abs"],
-                eps_rel=0.0 if coarse else settings["eps_rel"],
-            )
+            self._limit(min(int(ROUND * LONGER ** (turn // CYCLE)), most - used), coarse)
             result = self._solver.solve(raise_error=False)
             used, turn = used + int(result.info.iter), turn + 1
             name = osqp.SolverStatus(result.info.status_val).name
             if name == "OSQP_SIGINT":
                 raise KeyboardInterrupt
             z, y = result.x * d, (result.y * e)[: places.constraints]
-            if used >= most or name not in (*_UNFINISHED, "OSQP_SOLVED"):
-                break
             if name == "OSQP_SOLVED":
-                if not coarse or max(result.info.prim_res, result.info.dual_res) <= EXACT:
+                exact = not polishing or max(result.info.prim_res, result.info.dual_res) <= EXACT
+                if exact or not coarse:
                     break
                 coarse = False
-        status = _STATUS.get(name, QpStatus.FAILED)
-        message = "" if status is QpStatus.SOLVED else f"osqp: {result.info.status}"
-        return Answer(status, z, y, used, message)
+            elif name not in _UNFINISHED:
+                break
+            if used >= most:
+                break
+        return _Outcome(name, str(result.info.status), exact, z, y, used)
+
+    def _limit(self, iterations: int, coarse: bool) -> None:
+        settings = self._settings
+        eps_abs, eps_rel = (COARSE, 0.0) if coarse else (settings["eps_abs"], settings["eps_rel"])
+        # Most programs begin as the last one ended, and OSQP checks all settings each time.
+        if (iterations, eps_abs, eps_rel) != self._limits:
+            self._solver.update_settings(max_iter=iterations, eps_abs=eps_abs, eps_rel=eps_rel)
+            self._limits = (iterations, eps_abs, eps_rel)
 
     def _setup(self, p: Array, q: Array, a: Array, lower: Array, upper: Array) -> None:
-        places, n = self._sparsity, self._sparsity.variables
-        p_starts = np.searchsorted(self._p_columns, np.arange(n + 1))
+        places, n = self._part.sparsity, self._part.sparsity.variables
         # MKL, if it were installed, would give other last bits.
         self._solver = osqp.OSQP(algebra="builtin")
         self._solver.setup(
-            sparse.csc_matrix((p, self._p_rows, p_starts), shape=(n, n)),
+            sparse.csc_matrix((p, places.p_rows, places.p_starts), shape=(n, n)),
             q,
             sparse.csc_matrix((a, places.a_rows, places.a_starts), shape=(len(lower), n)),
             lower,
             upper,
             **self._settings,
         )
+
+
+@compiled
+def _same_model(
+    p: Array, a: Array, lower: Array, upper: Array,
+    equal: NDArray[np.bool_], p_inner: Index, p_known: Array, a_inner: Index, a_known: Array,
+) -> bool:  # fmt: skip
+    """Whether the same rows are equalities, and their numbers and those of their cost are the known ones."""
+    same = True
+    for i in range(len(lower)):
+        same = same and (lower[i] == upper[i]) == equal[i]
+    for k in range(len(p_inner)):
+        same = same and p[p_inner[k]] == p_known[k]
+    for k in range(len(a_inner)):
+        same = same and a[a_inner[k]] == a_known[k]
+    return same
+
+
+@compiled
+def _free_compliances(p: Array, p_rows: Index, diagonal: Index, n: int) -> Array:
+    """How far a unit force on each variable moves it without any rows."""
+    own = np.full(n, FREE)
+    for k in diagonal:
+        own[p_rows[k]] = 1.0 / max(p[k], 1.0 / FREE)
+    return own
+
+
+@compiled
+def _taken(
+    p: Array, q: Array, a: Array, lower: Array, upper: Array, own: Array, held: Array,
+    p_at: Index, p_rows: Index, p_columns: Index, columns: Index, a_at: Index, rows: Index, above: Index,
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]:  # fmt: skip
+    """Numbers of a part: cost in its variables' own measure, the rest as it is, and that measure."""
+    n, m = len(columns), len(rows)
+    own_part, held_part, d, pull = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    cost, entries, low, high = np.empty(len(p_at)), np.empty(len(a_at)), np.empty(m), np.empty(m)
+    for j in range(n):
+        own_part[j], held_part[j] = own[columns[j]], held[columns[j]]
+        d[j] = np.sqrt(own_part[j])
+        pull[j] = q[columns[j]] * d[j]
+    for k in range(len(p_at)):
+        cost[k] = p[p_at[k]] * d[p_rows[k]] * d[p_columns[k]]
+    for k in range(len(a_at)):
+        entries[k] = a[a_at[k]]
+    for i in range(m):
+        low[i], high[i] = lower[rows[i]], upper[above[i]]
+    return cost, pull, entries, low, high, own_part, held_part, d
 
 
 @compiled
@@ -236,6 +368,11 @@ def _weighed(
         reach[i] += a[k] * z[j]
     for i in range(m):
         stiffness = 1.0 / min(max(compliance[i], STIFF), FREE)
+        if lower[i] == -np.inf and upper[i] == np.inf:
+            # OSQP would factorise once more whenever a row loses or gains all its bounds.
+            e[i] = np.sqrt(OFF * stiffness)
+            low[i], high[i], y[i] = -FAR, np.inf, 0.0
+            continue
         if lower[i] == upper[i]:
             weight = equal * stiffness
         else:

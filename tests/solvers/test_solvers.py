@@ -403,7 +403,8 @@ def test_interrupt_taken_by_osqp_is_handed_on() -> None:
     solver.setup(CASES[2].program)
     solver.solve()
     backend = solver._backend
-    backend._solver = Interrupted(backend._solver)  # type: ignore[union-attr]
+    workspace = backend._most  # type: ignore[union-attr]
+    workspace._solver = Interrupted(workspace._solver)
     with pytest.raises(KeyboardInterrupt):
         solver.solve()
 
