@@ -35,6 +35,8 @@ class GuidanceSettings:
     """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
     path: float = 4.8
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
+    wide_path: float = 3.5
+    """The same with margins that take the wide lattice [1/m^2 per metre]."""
     shape: float = 9.0
     """Price of a squared difference to the mean of all offsets [1/m^2 per metre]."""
     far_m: float = 7.0
@@ -44,8 +46,8 @@ class GuidanceSettings:
     steep: float = 0.7
     """Slope from which that price rises with the slope's fourth power, ..."""
     steep_far: float = 0.25
-    """... and the same for offsets aside beyond ``far_m``. Far out every metre is dear, so a wide detour would
-    be left for last, at the steepest slope there is, and then be too late; so it is planned gently."""
+    """... and the same for offsets aside beyond ``far_m``. Far out every metre is dear, so a wide detour
+    would be left for last, at the steepest slope there is, and be too late; so it is planned gently."""
     bend: float = 10.0
     """Price of a squared change of slope per metre [m^2 per metre]."""
     keep: float = 1.0
@@ -121,7 +123,7 @@ def _lattice(settings: GuidanceSettings, scale: int) -> Lattice:
 def _prices(settings: GuidanceSettings, scale: int) -> Prices:
     """Prices with all lengths a number of times as long: the same shapes, only larger."""
     return Prices(
-        settings.path,
+        settings.path if scale == 1 else settings.wide_path,
         settings.shape,
         settings.far_m * scale,
         settings.slope * scale**2,
