@@ -33,15 +33,15 @@ class GuidanceSettings:
     """Layers to pass spheres, half of them up and half down."""
     wide_m: float = 6.0
     """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
-    path: float = 4.8
+    path: float = 6.0
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
     wide_path: float = 3.5
     """The same with margins that take the wide lattice [1/m^2 per metre]."""
     shape: float = 9.0
     """Price of a squared difference to the mean of all offsets [1/m^2 per metre]."""
-    far_m: float = 7.0
+    far_m: float = 5.5
     """Offsets beyond this are priced linearly [m]."""
-    slope: float = 6.0
+    slope: float = 8.0
     """Price of a squared slope [per metre]."""
     steep: float = 0.7
     """Slope from which that price rises with the slope's fourth power, ..."""
