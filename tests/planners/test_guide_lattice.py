@@ -29,6 +29,7 @@ from napf_mpc.planners.guide_lattice import (
     missing_price,
     price_ahead,
     steep,
+    steep_limit,
 )
 from napf_mpc.planners.guide_search import make_scratch
 from napf_mpc.planners.guide_settings import GuidanceSettings, search_of
@@ -39,7 +40,7 @@ Array = NDArray[np.float64]
 
 SEARCH = search_of(GuidanceSettings(widest_m=10.0, ahead_m=40.0), 3.0, 0.3)
 LATTICE, PRICES = SEARCH.lattice, SEARCH.prices
-GENTLE = PRICES._replace(path=1.5, slope=16.0, steep=0.7, far_m=8.0)
+GENTLE = PRICES._replace(path=1.5, slope=16.0, steep=0.7, steep_far=0.7, far_m=8.0)
 """Prices for which the way back to the lane is nowhere steep, which :func:`price_ahead` leaves out."""
 BELOW, LAYERS, CELLS = 4, 9, 2 * LATTICE.half + 1
 LANE = np.array([3.0, 0.5])
@@ -120,7 +121,10 @@ def exhaustive(
         best = np.full_like(value, np.inf)
         for dv, dc in product(range(-1, 2), range(-2, 3)):
             square = (dc * cell) ** 2 + (dv * layer) ** 2
-            edge = weight * prices.slope * steep(math.sqrt(square) / step, prices.steep) * square / step
+            aside = cell * np.abs(np.arange(CELLS) - LATTICE.half)  # of the place that the step leads to
+            limits = np.where(aside > prices.far_m, prices.steep_far, prices.steep)
+            factor = np.array([steep(math.sqrt(square) / step, float(limit)) for limit in limits])
+            edge = weight * prices.slope * factor * square / step
             best = np.minimum(best, padded[1 - dv : 1 - dv + LAYERS, 2 - dc : 2 - dc + CELLS] + edge)
         value = best + node[s]
     return float(value.min())
@@ -206,10 +210,10 @@ def test_nothing_costs_less_than_the_price_ahead_says(prices: Prices, part: floa
 
 
 def test_the_wide_lattice_has_the_same_shapes_and_twice_as_large() -> None:
-    """A profile of twice the size costs four times as much a metre there, in each of its parts.
+    """A profile of twice the size costs four times as much a metre there, in slopes and bends.
 
-    Offsets, slopes and bends have to grow alike, or a wide margin would be passed in another way than a
-    narrow one: earlier, or in a sharper turn.
+    They have to grow alike, or a wide margin would be passed in a sharper turn than a narrow one. Offsets
+    have a price of their own there.
     """
     one, two, wide = SEARCH.prices, SEARCH.wide_prices, SEARCH.wide
     assert wide.step_m == pytest.approx(2.0 * LATTICE.step_m)
@@ -227,11 +231,15 @@ def test_the_wide_lattice_has_the_same_shapes_and_twice_as_large() -> None:
             return step * np.array(
                 [
                     sum(by.path * bent(float(at @ at), by.far_m) for at in profile),
-                    sum(by.slope * steep(float(each), by.steep) * each**2 for each in size),
+                    sum(
+                        by.slope * steep(float(each), steep_limit(float(at[0]), by)) * each**2
+                        for each, at in zip(size, profile[1:], strict=True)
+                    ),
                     by.bend * (bend**2).sum(),
                 ]
             )
 
         narrow = price(offset, LATTICE.step_m, one)
         assert (narrow > 0.0).all()
-        np.testing.assert_allclose(price(2.0 * offset, wide.step_m, two), 8.0 * narrow, rtol=1e-12)
+        dearer = np.array([two.path / one.path, 1.0, 1.0])
+        np.testing.assert_allclose(price(2.0 * offset, wide.step_m, two), 8.0 * dearer * narrow, rtol=1e-12)

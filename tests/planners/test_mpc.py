@@ -15,6 +15,7 @@ from napf_mpc.constraints.constraint import Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, TiltLimit
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.mpc import QpPlanner, default_constraints
 from napf_mpc.planners.plan import standing_plan
 from napf_mpc.planners.planner import Command, Reason
@@ -99,7 +100,7 @@ def test_on_the_slots_in_free_air_the_plan_is_to_fly_straight_on_with_hover_thru
 
 
 def test_a_plan_keeps_k_sigma_and_its_radius_clear_of_a_wall_beside_the_lane() -> None:
-    asked = problem(planner={"kind": "qp", "influence_scale": 1e-6, "guidance": "none"})
+    asked = problem(planner={"kind": "qp", "influence_scale": 1e-6, "guidance": "none", "cohesion": 0.0})
     planner = QpPlanner(asked)
     slots = on_slots(planner)
     # The face is 0.7 m inside the margin of 3 * 0.3 + 0.3 m and what is kept on top of it.
@@ -250,7 +251,7 @@ def test_a_plan_that_stands_though_its_guide_leads_on_is_taken_from_the_guide() 
         )
         plan.states[0, 0, :, 0] += planned_m * planner._model.times_s / planner._model.times_s[-1]
         planner._plan = plan
-        return planner._guess(state, reference, 0.0)[0][..., 0:6:2]
+        return planner._guess(state, reference, planner._carried(state, 0.0), 0.0)[0][..., 0:6:2]
 
     np.testing.assert_array_equal(guess(leads, 0.0), leads[..., 0:6:2])
     # One that gets along by itself is left alone, and so are all where the guide holds as well.
@@ -266,6 +267,43 @@ def test_a_plan_that_stands_though_its_guide_leads_on_is_taken_from_the_guide() 
     np.testing.assert_allclose(
         guess(leads, 0.0), np.broadcast_to(slots[:, :, None], (1, 4, planner._model.stages, 3)), atol=1e-12
     )
+
+
+def test_rows_are_not_made_at_a_plan_that_leads_through_a_wall() -> None:
+    """The first UAV's plan has been pressed through: its rows speak of its near side, all of them."""
+    planner = QpPlanner(problem(mission={"length_m": 60.0}), guided=False)
+    slots = on_slots(planner)
+    face = float(slots[0, 0, 0]) + 4.0
+    planner.reset(ObstacleSet.from_shapes([Box((face + 0.25, 3.0, 0.0), (0.5, 3.0, 50.0), 0.0)]), 1)
+    plan = standing_plan(planner.problem.vehicle, planner._yaw, 0.0, planner._model.step_s, slots)
+    plan.states[0, 0, :, 0] += 2.0 * planner._model.times_s
+    planner._plan = plan
+    planner.step(nav(slots), 0.0)
+    horizon = planner._last_horizon
+    assert horizon is not None
+    assert face - 1.5 < horizon.position[0, 0, :, 0].max() < face
+    normal = planner.constraints[0].rows(horizon).jac[0, 0, :, 0]
+    near = np.linalg.norm(normal, axis=-1) > 0.0
+    assert near.any()
+    assert (normal[near, 0] < 0.0).all()
+
+
+def test_a_filtered_estimate_follows_the_taut_way_and_raw_measurements_the_guide_itself() -> None:
+    planner = QpPlanner(problem(mission={"length_m": 60.0}))
+    planner.reset(ObstacleSet.empty(), 1)
+    slots = on_slots(planner)
+    offset = np.full((1, 4, 49, 2), 2.0)
+    guide = Guide(
+        np.arange(49.0), offset, np.ones((1, 4)), np.full((1, 4), Passage.DETOUR, dtype=np.int8),
+        np.zeros((1, 4)), 0.25 * offset, np.zeros((1, 4, 49)),
+    )  # fmt: skip
+    raw = nav(slots, sigma_m=0.0)
+    everybody = raw.trusted()
+    for solution, expected in ((raw, 2.0), (replace(raw, filtered=True), 0.5)):
+        state = planner._state(solution, everybody)
+        reference, way = planner._references(state, None, solution, everybody, guide)
+        np.testing.assert_allclose(reference[0, :, :, 2] - slots[0, :, None, 1], expected, atol=1e-9)
+        np.testing.assert_allclose(way[0, :, :, 2] - slots[0, :, None, 1], 2.0, atol=1e-9)
 
 
 def test_from_standing_before_a_wall_a_uav_is_led_past_it() -> None:

@@ -1,0 +1,91 @@
+"""A guide's way pulled taut: to the margin and no farther, on the same side, and back in time."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from napf_mpc.formation import PathFrame
+from napf_mpc.planners.guide import Guide, Passage
+from napf_mpc.planners.guide_clearance import frame_of
+from napf_mpc.planners.taut import pulled_taut
+from napf_mpc.world.obstacles import ObstacleSet
+from napf_mpc.world.shapes import Box, Shape, Sphere
+
+Array = NDArray[np.float64]
+
+STEP, STATIONS = 1.0, 49
+RADIUS, SIGMA, K = 0.3, 0.5, 3.0
+NEED = RADIUS + K * SIGMA
+LANE = np.array([[3.0, 0.0]])
+PATH = PathFrame.from_angles((0.0, 0.0, 0.0), 0.0, 0.0)
+
+
+def pulled(profile: Array, shapes: list[Shape], slope: float = 100.0) -> tuple[Array, Array]:
+    """Offsets (station, 2) and how loose they are, of one UAV that starts at 0."""
+    offsets, loose = pulled_taut(
+        profile[None, None], np.zeros((1, 1)), STEP, LANE, frame_of(PATH), ObstacleSet.from_shapes(shapes),
+        SIGMA**2 * np.eye(3)[None, None], K, RADIUS, slope,
+    )  # fmt: skip
+    return offsets[0, 0], loose[0, 0]
+
+
+def aside(left: float, up: float = 0.0) -> Array:
+    return np.tile([left, up], (STATIONS, 1))
+
+
+def test_without_anything_in_between_the_way_is_the_lane() -> None:
+    far = Sphere((24.0, -40.0, 0.0), 1.0)
+    offsets, loose = pulled(aside(5.0, 2.0), [far])
+    np.testing.assert_allclose(offsets, 0.0, atol=1e-12)
+    np.testing.assert_array_equal(loose, 1.0)
+
+
+def test_beside_an_obstacle_it_keeps_the_margin_and_hardly_more() -> None:
+    ball = Sphere((24.0, 3.0, 0.0), 1.0)
+    offsets, loose = pulled(aside(5.0), [ball])
+    # At the sphere itself: in steps of a fifth of five metres, never nearer than the margin.
+    assert 1.0 + NEED <= offsets[24, 0] <= 1.0 + NEED + 1.0
+    assert loose[24] == pytest.approx(1.0 - offsets[24, 0] / 5.0)
+    places = np.stack([STEP * np.arange(STATIONS), LANE[0, 0] + offsets[:, 0], offsets[:, 1]], axis=-1)
+    assert ObstacleSet.from_shapes([ball]).signed_distance(places[None]).min() >= NEED
+    np.testing.assert_array_equal(offsets[:20], 0.0)
+
+
+def test_it_is_not_pulled_across_what_stands_between_it_and_the_lane() -> None:
+    """A wall beside the way, the lane free behind it."""
+    wall = Box((24.0, 7.0, 0.0), (60.0, 0.5, 50.0))
+    offsets, _ = pulled(aside(8.0), [wall])
+    assert (LANE[0, 0] + offsets[:, 0] >= 7.25 + NEED).all()
+
+
+def test_a_way_that_is_inside_a_margin_already_stays() -> None:
+    ball = Sphere((24.0, 3.0, 0.0), 1.0)
+    offsets, loose = pulled(aside(2.5), [ball])
+    assert offsets[24, 0] == 2.5
+    assert loose[24] == 0.0
+
+
+def test_it_leads_back_at_a_slope_that_can_be_flown() -> None:
+    wall = Box((40.0, 3.0, 0.0), (4.0, 10.0, 200.0))
+    offsets, _ = pulled(aside(8.0), [wall], slope=0.25)
+    needed = offsets[38:43, 0].min()
+    assert needed >= 5.0 + NEED
+    rising = np.diff(offsets[:, 0])[:38]
+    assert rising.max() <= 0.25 + 1e-12
+    assert offsets[0, 0] == 0.0
+    assert offsets[30, 0] > 4.0  # not yet beside the wall, but on the way out
+    # Behind the wall nothing asks for more.
+    np.testing.assert_array_equal(offsets[46:], 0.0)
+
+
+def test_uavs_that_hold_stay_on_the_guides_way() -> None:
+    offset, taut = np.ones((1, 2, 5, 2)), np.zeros((1, 2, 5, 2))
+    reason = np.array([[Passage.DETOUR, Passage.HOLD]], dtype=np.int8)
+    guide = Guide(np.arange(5.0), offset, np.ones((1, 2)), reason, np.zeros((1, 2)), taut, np.ones((1, 2, 5)))
+    np.testing.assert_array_equal(guide.pulled().offset[0, 0], 0.0)
+    np.testing.assert_array_equal(guide.pulled().offset[0, 1], 1.0)
+    np.testing.assert_array_equal(guide.loose_at(np.ones((1, 2, 3)))[0, :, 0], [1.0, 0.0])
+    np.testing.assert_array_equal(guide.on_lanes().offset, 0.0)
+    plain = Guide(np.arange(5.0), offset, np.ones((1, 2)), reason, np.zeros((1, 2)))
+    assert plain.pulled() is plain
+    np.testing.assert_array_equal(plain.loose_at(np.ones((1, 2, 3))), 0.0)
