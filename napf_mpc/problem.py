@@ -667,7 +667,7 @@ class Planner(_Section):
     """QP planner: weight of the distance to the slot [1/(m^2 s)]."""
     cohesion: float = Field(0.8, ge=0.0, le=0.95)
     """QP planner: share of the UAVs' mean sideways deviation that each is drawn along with."""
-    velocity_weight: float = Field(1.0, ge=0.0, le=1e6)
+    velocity_weight: float = Field(4.0, ge=0.0, le=1e6)
     """QP planner: weight of the velocity error [s/m^2]."""
     attitude_weight: float = Field(1.0, ge=0.0, le=1e6)
     """QP planner: weight of roll, pitch and yaw error [1/(rad^2 s)]; a fifth of it on body rates."""
@@ -677,7 +677,7 @@ class Planner(_Section):
     """QP planner: weight of the torques [1/(N^2 m^2 s)]."""
     contact_price: float = Field(300.0, ge=0.0, le=1e9)
     """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]."""
-    contact_extra_m: float = Field(0.5, ge=0.0, le=1e3)
+    contact_extra_m: float = Field(0.6, ge=0.0, le=1e3)
     """QP planner: distance kept from obstacles on top of the margin."""
     altitude_m: tuple[Coordinate, Coordinate] | None = None
     """QP planner: least and largest height to fly at; none by default."""

@@ -33,7 +33,7 @@ class GuidanceSettings:
     """Layers to pass spheres, half of them up and half down."""
     wide_m: float = 6.0
     """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
-    path: float = 6.0
+    path: float = 6.5
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
     wide_path: float = 3.5
     """The same with margins that take the wide lattice [1/m^2 per metre]."""

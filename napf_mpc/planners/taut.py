@@ -29,6 +29,8 @@ STEPS = 5
 """Places looked at between the guide's way and the lane."""
 SAME_M = 0.01
 """Offsets below this are none."""
+NEAR_M = 0.05
+"""How near to the margin a place comes."""
 
 
 def pulled_taut(
@@ -85,6 +87,30 @@ def pulled_taut(
 
 
 @compiled
+def _short(
+    solids: Solids,
+    tree: BoxTree,
+    scene: int,
+    frame: Frame,
+    along: float,
+    left: float,
+    up: float,
+    covariance: Array,
+    k: float,
+    radius_m: float,
+    nodes: NDArray[np.int64],
+    bounds: Array,
+) -> bool:
+    """Whether a place in path coordinates lacks the margin."""
+    ax = frame.axes
+    px = frame.origin[0] + along * ax[0, 0] + left * ax[1, 0] + up * ax[2, 0]
+    py = frame.origin[1] + along * ax[0, 1] + left * ax[1, 1] + up * ax[2, 1]
+    pz = frame.origin[2] + along * ax[0, 2] + left * ax[1, 2] + up * ax[2, 2]
+    d, gx, gy, gz, _ = nearest_obstacle(solids, tree, scene, px, py, pz, nodes, bounds)
+    return bool(radius_m + k * sigma_along(covariance, gx, gy, gz) > d)
+
+
+@compiled
 def _pull(
     solids: Solids,
     tree: BoxTree,
@@ -106,47 +132,39 @@ def _pull(
     for run in range(runs):
         scene = 0 if len(scene_start) == 2 else run
         for uav in range(uavs):
-            c = covariance[run, uav]
+            c, y, z = covariance[run, uav], lanes[uav, 0], lanes[uav, 1]
             ahead = 0.0
             for s in range(stations - 1, -1, -1):
                 left, up = out[run, uav, s]
                 size = math.sqrt(left * left + up * up)
                 # Backwards: from here, what lies ahead has to be reached at no more than the slope.
-                limit = size - (ahead - most)
-                pulled = 0.0
+                limit = min(size - (ahead - most), size)
                 ahead = size
                 if size < SAME_M or limit <= 0.0:
                     loose[run, uav, s] = 1.0 if size < SAME_M else 0.0
                     continue
+                place, pulled, blocked = along[run, uav] + s * step_m, 0.0, -1.0
                 for step in range(1, STEPS + 1):
-                    want = min(size * step / STEPS, limit)
+                    want = limit * step / STEPS
                     kept = 1.0 - want / size
-                    place = along[run, uav] + s * step_m
-                    y, z = lanes[uav, 0] + kept * left, lanes[uav, 1] + kept * up
-                    px = (
-                        frame.origin[0]
-                        + place * frame.axes[0, 0]
-                        + y * frame.axes[1, 0]
-                        + z * frame.axes[2, 0]
-                    )
-                    py = (
-                        frame.origin[1]
-                        + place * frame.axes[0, 1]
-                        + y * frame.axes[1, 1]
-                        + z * frame.axes[2, 1]
-                    )
-                    pz = (
-                        frame.origin[2]
-                        + place * frame.axes[0, 2]
-                        + y * frame.axes[1, 2]
-                        + z * frame.axes[2, 2]
-                    )
-                    d, gx, gy, gz, _ = nearest_obstacle(solids, tree, scene, px, py, pz, nodes, bounds)
-                    if radius_m + k * sigma_along(c, gx, gy, gz) > d:
+                    if _short(
+                        solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
+                        nodes, bounds,
+                    ):  # fmt: skip
+                        blocked = want
                         break
                     pulled = want
-                    if want == limit:
-                        break
+                # To the margin itself: a place that jumps by a step from plan to plan would be flown.
+                while blocked - pulled > NEAR_M:
+                    want = 0.5 * (pulled + blocked)
+                    kept = 1.0 - want / size
+                    if _short(
+                        solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
+                        nodes, bounds,
+                    ):  # fmt: skip
+                        blocked = want
+                    else:
+                        pulled = want
                 ahead = size - pulled
                 loose[run, uav, s] = pulled / size
                 out[run, uav, s, 0] = left * (1.0 - pulled / size)
