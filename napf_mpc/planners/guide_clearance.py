@@ -159,6 +159,17 @@ def look(sight: Sight, boxes: SolidBoxes, i: int) -> None:
 
 
 @compiled
+def world_place(frame: Frame, along: float, left: float, up: float) -> tuple[float, float, float]:
+    """Place in the world of path coordinates [m]."""
+    ax = frame.axes
+    return (
+        frame.origin[0] + along * ax[0, 0] + left * ax[1, 0] + up * ax[2, 0],
+        frame.origin[1] + along * ax[0, 1] + left * ax[1, 1] + up * ax[2, 1],
+        frame.origin[2] + along * ax[0, 2] + left * ax[1, 2] + up * ax[2, 2],
+    )
+
+
+@compiled
 def shortfall(
     solids: Solids,
     i: int,
@@ -193,9 +204,7 @@ def shortfall(
         Shortfall [m], and the gradient's parts to the left and up.
     """
     ax = frame.axes
-    px = frame.origin[0] + along * ax[0, 0] + left * ax[1, 0] + up * ax[2, 0]
-    py = frame.origin[1] + along * ax[0, 1] + left * ax[1, 1] + up * ax[2, 1]
-    pz = frame.origin[2] + along * ax[0, 2] + left * ax[1, 2] + up * ax[2, 2]
+    px, py, pz = world_place(frame, along, left, up)
     d, gx, gy, gz = signed_distance(solids, i, px, py, pz)
     c = covariance
     variance = c[0, 0] * gx * gx + c[1, 1] * gy * gy + c[2, 2] * gz * gz

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.constraints.probability import sigma_along
 from napf_mpc.jit import compiled
-from napf_mpc.planners.guide_clearance import Frame
+from napf_mpc.planners.guide_clearance import Frame, world_place
 from napf_mpc.world.bounding_tree import STACK, BoxTree
 from napf_mpc.world.distance import Solids
 from napf_mpc.world.obstacles import ObstacleSet
@@ -102,10 +102,7 @@ def _short(
     bounds: Array,
 ) -> bool:
     """Whether a place in path coordinates lacks the margin."""
-    ax = frame.axes
-    px = frame.origin[0] + along * ax[0, 0] + left * ax[1, 0] + up * ax[2, 0]
-    py = frame.origin[1] + along * ax[0, 1] + left * ax[1, 1] + up * ax[2, 1]
-    pz = frame.origin[2] + along * ax[0, 2] + left * ax[1, 2] + up * ax[2, 2]
+    px, py, pz = world_place(frame, along, left, up)
     d, gx, gy, gz, _ = nearest_obstacle(solids, tree, scene, px, py, pz, nodes, bounds)
     return bool(radius_m + k * sigma_along(covariance, gx, gy, gz) > d)
 
@@ -144,19 +141,18 @@ def _pull(
                     loose[run, uav, s] = 1.0 if size < SAME_M else 0.0
                     continue
                 place, pulled, blocked = along[run, uav] + s * step_m, 0.0, -1.0
-                for step in range(1, STEPS + 1):
-                    want = limit * step / STEPS
-                    kept = 1.0 - want / size
-                    if _short(
-                        solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
-                        nodes, bounds,
-                    ):  # fmt: skip
-                        blocked = want
+                step = 1
+                while True:
+                    if blocked >= 0.0:
+                        # To the margin itself: what jumps by a step from plan to plan would be flown.
+                        if blocked - pulled <= NEAR_M:
+                            break
+                        want = 0.5 * (pulled + blocked)
+                    elif step <= STEPS:
+                        want = limit * step / STEPS
+                        step += 1
+                    else:
                         break
-                    pulled = want
-                # To the margin itself: a place that jumps by a step from plan to plan would be flown.
-                while blocked - pulled > NEAR_M:
-                    want = 0.5 * (pulled + blocked)
                     kept = 1.0 - want / size
                     if _short(
                         solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
