@@ -665,7 +665,7 @@ class Planner(_Section):
     """QP planner: nearest obstacles that each stage of each UAV keeps rows for, in each of two shells."""
     position_weight: float = Field(5.0, ge=1e-6, le=1e6)
     """QP planner: weight of the distance to the slot [1/(m^2 s)]."""
-    cohesion: float = Field(0.8, ge=0.0, le=0.95)
+    cohesion: float = Field(0.86, ge=0.0, le=0.95)
     """QP planner: share of the UAVs' mean sideways deviation that each is drawn along with."""
     velocity_weight: float = Field(4.0, ge=0.0, le=1e6)
     """QP planner: weight of the velocity error [s/m^2]."""

@@ -8,6 +8,8 @@ formation slows, holds in front of it, and if the hold lasts too long, gives up 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,8 +74,7 @@ class Guidance:
         self._obstacles = obstacles
         self._boxes: SolidBoxes = solid_boxes(obstacles, self._path)
         self._profiles = np.zeros((runs, uavs, stations, 2))
-        self._taut = np.zeros_like(self._profiles)
-        self._loose = np.ones((runs, uavs, stations))
+        self._taut: Array | None = None
         self._missing = np.zeros((runs, uavs, stations))
         self._busy = np.zeros(runs, dtype=bool)
         self._planned_at = np.zeros((runs, uavs))
@@ -97,6 +98,7 @@ class Guidance:
         trusted: NDArray[np.bool_],
         time_s: float,
         tracks: Tracks | None = None,
+        taut: bool = False,
     ) -> Guide:
         """Guide from what navigation reports; plans anew when its period has passed.
 
@@ -112,6 +114,8 @@ class Guidance:
             Time since the start [s].
         tracks : Tracks, optional
             Moving obstacles to slow down for.
+        taut : bool
+            Whether new plans come with their taut ways, see :mod:`.taut`.
 
         Returns
         -------
@@ -125,10 +129,10 @@ class Guidance:
         due = time_s >= self._next_s - 1e-9
         if due:
             elapsed = 0.0 if np.isnan(self._last_s) else time_s - self._last_s
-            self._plan(place, elapsed)
+            self._plan(place, elapsed, taut)
             self._last_s = time_s
             self._next_s = time_s + self.settings.period_s
-        guide = self._guide(along, self._from(self._profiles, along), self._from(self._taut, along))
+        guide = self._guide(along)
         if tracks is None or not tracks.count:
             return guide
         if due:
@@ -138,12 +142,12 @@ class Guidance:
         return slowed(guide, self._traffic_pace)
 
     def _from(self, profiles: Array, along: Array) -> Array:
-        """Profiles (run, uav, station, 2) as seen from along-track places (run, uav)."""
+        """Profiles (run, uav, station, channel) as seen from along-track places (run, uav)."""
         out = np.empty_like(profiles)
         resample_all(profiles, along - self._planned_at, self._step_m, out)
         return out
 
-    def _plan(self, place: Array, elapsed_s: float) -> None:
+    def _plan(self, place: Array, elapsed_s: float, taut: bool) -> None:
         # Stations stand still in the world: a gap must not open and close with where the samples fall.
         step = self.settings.step_m
         along = np.floor(place[..., 0] / step) * step
@@ -169,10 +173,13 @@ class Guidance:
             self._busy,
         )
         self._planned_at = along
-        self._taut, self._loose = pulled_taut(
-            self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
-            self._inflation.k, self._search.radius_m + self._extra_m, self.settings.taut_slope,
-        )  # fmt: skip
+        self._taut = None
+        if taut:
+            pulled, loose = pulled_taut(
+                self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
+                self._inflation.k, self._search.radius_m + self._extra_m, self.settings.taut_slope,
+            )  # fmt: skip
+            self._taut = np.concatenate([pulled, loose[..., None]], axis=-1)
         self._hold(offset, elapsed_s)
 
     def _margin_covariance(self, elapsed_s: float) -> Array:
@@ -198,9 +205,8 @@ class Guidance:
         # Where a UAV is already inside the margin, a way that gets no worse leads out.
         here = np.maximum(breach[..., 0], breach[..., 1])
         worse = breach - here[..., None]
-        # With margins of ten metres an estimate wanders by more than what counts with margins of two.
         margin = self._inflation.k * rms_sigma(self._covariance).max(-1)
-        scale = np.maximum(1.0, margin / settings.usual_margin_m) ** 1.5
+        scale = np.maximum(1.0, margin / settings.usual_margin_m) ** settings.tolerance_power
         distance = self._blocked_at(worse, settings.tolerance_m * scale)
         self._squeezing &= distance <= settings.stop_m + settings.slow_m
         self._squeezing |= self._held_s >= settings.squeeze_after_s
@@ -232,8 +238,8 @@ class Guidance:
         blocked = breach > tolerance_m[:, None, None]
         return np.asarray(np.where(blocked, self.ahead_m, np.inf).min((-1, -2)))
 
-    def _guide(self, along: Array, offset: Array, taut: Array) -> Guide:
-        settings = self.settings
+    def _guide(self, along: Array) -> Guide:
+        settings, offset = self.settings, self._from(self._profiles, along)
         sigma = np.sqrt(np.maximum(np.einsum("ruab,a,b->ru", self._covariance, *[self._path.along] * 2), 0.0))
         error = synchronisation_error(along, self._slots[:, 0])
         behind = -error - settings.left_behind_m - 2.0 * sigma
@@ -249,4 +255,8 @@ class Guidance:
         reason[self._holding] = Passage.HOLD
         reason[self._given_up] = Passage.NO_PASSAGE
         breach = np.maximum(self._missing.max(-1, initial=0.0) - settings.spare_m, 0.0)
-        return Guide(self.ahead_m, offset, pace, reason, breach, taut, self._loose)
+        guide = Guide(self.ahead_m, offset, pace, reason, breach)
+        if self._taut is None:
+            return guide
+        taut = self._from(self._taut, along)
+        return replace(guide, taut=taut[..., :2], loose=taut[..., 2])

@@ -62,7 +62,8 @@ class Prices(NamedTuple):
     far_m: float  # beyond this, offsets cost linearly: a long way round beats a squeeze
     slope: float  # squared slope
     steep: float  # slope from which that price rises with its fourth power,
-    steep_far: float  # and to offsets aside of more than far_m
+    steep_far: float  # and the same to offsets aside of more than
+    gentle_m: float
     bend: float  # squared change of slope [m^2]
     keep: float  # squared difference to the last profile [1/m^2], up to keep_m
     keep_m: float
@@ -93,7 +94,7 @@ def steep(slope: float, limit: float) -> float:
 @compiled
 def steep_limit(left_m: float, prices: Prices) -> float:
     """Slope from which slopes cost more on the way to an offset."""
-    return prices.steep_far if abs(left_m) > prices.far_m else prices.steep
+    return prices.steep_far if abs(left_m) > prices.gentle_m else prices.steep
 
 
 @compiled
@@ -377,7 +378,7 @@ def edge_prices(lattice: Lattice, prices: Prices, weight: float, edge: Array) ->
 
 @compiled
 def _is_far(c: int, lattice: Lattice, prices: Prices) -> int:
-    return 1 if abs(c - lattice.half) * lattice.cell_m > prices.far_m else 0
+    return 1 if abs(c - lattice.half) * lattice.cell_m > prices.gentle_m else 0
 
 
 @compiled
@@ -626,7 +627,7 @@ def search_within(
     weight = float(query.stop - query.first)
     value = bench.value
     window = (start_layer, start_layer, start_cell, start_cell)
-    near = int(np.floor(prices.far_m / lattice.cell_m))
+    near = int(np.floor(prices.gentle_m / lattice.cell_m))
     first, last = max(0, lattice.half - near), min(cells - 1, lattice.half + near)
     if query.aside >= 0.0:
         window = (lowest, highest, 0, cells - 1)

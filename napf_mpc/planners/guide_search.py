@@ -78,13 +78,13 @@ class Search(NamedTuple):
 
 @compiled
 def resample(profile: Array, shift_m: float, step_m: float, out: Array) -> None:
-    """Profile (station, 2) as seen ``shift_m`` farther along; its ends go on beyond."""
+    """Profile (station, channel) as seen ``shift_m`` farther along; its ends go on beyond."""
     stations = profile.shape[0]
     for s in range(stations):
         at = min(max(s + shift_m / step_m, 0.0), stations - 1.0)
         lower = min(int(at), stations - 2)
         part = at - lower
-        for a in range(2):
+        for a in range(profile.shape[1]):
             out[s, a] = (1.0 - part) * profile[lower, a] + part * profile[lower + 1, a]
 
 
@@ -462,7 +462,7 @@ def plan_all(
 
 @compiled
 def resample_all(profiles: Array, shift_m: Array, step_m: float, out: Array) -> None:
-    """Profiles (run, uav, station, 2) as seen from where the UAVs have come to, in place."""
+    """Profiles (run, uav, station, channel) as seen from where the UAVs have come to, in place."""
     for r in range(profiles.shape[0]):
         for i in range(profiles.shape[1]):
             resample(profiles[r, i], shift_m[r, i], step_m, out[r, i])

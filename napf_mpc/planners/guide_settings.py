@@ -33,21 +33,23 @@ class GuidanceSettings:
     """Layers to pass spheres, half of them up and half down."""
     wide_m: float = 6.0
     """With a radius and margin beyond this, cells and layers are doubled, and reach twice as far [m]."""
-    path: float = 6.5
+    path: float = 8.5
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
-    wide_path: float = 3.5
+    wide_path: float = 3.8
     """The same with margins that take the wide lattice [1/m^2 per metre]."""
     shape: float = 9.0
     """Price of a squared difference to the mean of all offsets [1/m^2 per metre]."""
-    far_m: float = 5.5
+    far_m: float = 12.0
     """Offsets beyond this are priced linearly [m]."""
     slope: float = 8.0
     """Price of a squared slope [per metre]."""
     steep: float = 0.7
     """Slope from which that price rises with the slope's fourth power, ..."""
     steep_far: float = 0.25
-    """... and the same for offsets aside beyond ``far_m``. Far out every metre is dear, so a wide detour
+    """... and the same for offsets aside beyond ``gentle_m``. Far out every metre is dear, so a wide detour
     would be left for last, at the steepest slope there is, and be too late; so it is planned gently."""
+    gentle_m: float = 5.5
+    """See ``steep_far`` [m]."""
     bend: float = 10.0
     """Price of a squared change of slope per metre [m^2 per metre]."""
     keep: float = 1.0
@@ -58,7 +60,7 @@ class GuidanceSettings:
     """Distance kept beyond radius and k sigma, where there is room [m]."""
     spare: float = 200.0
     """Price of a squared lack of spare [1/m^2 per metre]."""
-    breach: float = 5000.0
+    breach: float = 6500.0
     """Price of a lack of margin [1/m per metre]."""
     start: float = 30.0
     """Price of a squared distance of the start from where the UAV is, where something is near [1/m^2]."""
@@ -78,10 +80,12 @@ class GuidanceSettings:
     """Slope that is flown at full pace."""
     bend_m: float = 6.0
     """Distance over which steeper pieces are slowed down for [m]."""
-    tolerance_m: float = 0.35
+    tolerance_m: float = 0.2
     """Breach from which a way counts as blocked [m]."""
     usual_margin_m: float = 2.5
-    """Tolerance and squeeze are for margins k sigma up to this; beyond, they grow with its power 1.5 [m]."""
+    """Tolerance and squeeze are for margins k sigma up to this [m]; beyond, they grow with its power ..."""
+    tolerance_power: float = 1.8
+    """... of this: with margins of ten metres an estimate wanders by more than what counts with two."""
     stop_m: float = 4.0
     """Distance to a blocked place at which the formation holds [m]."""
     slow_m: float = 5.0
@@ -122,13 +126,14 @@ def _lattice(settings: GuidanceSettings, scale: int) -> Lattice:
 
 def _prices(settings: GuidanceSettings, scale: int) -> Prices:
     """Prices with all lengths a number of times as long: the same shapes, only larger."""
-    return Prices(
+    prices = (
         settings.path if scale == 1 else settings.wide_path,
         settings.shape,
         settings.far_m * scale,
         settings.slope * scale**2,
         settings.steep,
         settings.steep_far,
+        settings.gentle_m * scale,
         settings.bend * scale**4,
         settings.keep,
         settings.keep_m,
@@ -140,6 +145,8 @@ def _prices(settings: GuidanceSettings, scale: int) -> Prices:
         settings.start,
         settings.apart,
     )
+    # A whole number is a number too, but to the compiled search another type.
+    return Prices(*map(float, prices))
 
 
 def search_of(settings: GuidanceSettings, k: float, radius_m: float) -> Search:

@@ -192,7 +192,8 @@ class QpPlanner:
         covariance = np.where(trusted[..., None, None], nav.position_covariance, np.eye(3))
         guide = None
         if self._guidance is not None:
-            guide = self._guidance.step(state[..., POSITION], covariance, trusted, time_s)
+            # Raw measurements jump by more than what a taut way could gain.
+            guide = self._guidance.step(state[..., POSITION], covariance, trusted, time_s, taut=nav.filtered)
         carried = self._carried(state, time_s)
         reference, way = self._references(state, carried, nav, trusted, guide)
         began = 0.0 if self._clock is None else self._clock()
@@ -272,14 +273,11 @@ class QpPlanner:
             free = reference = way = self._slots.over(place, times, sigma)
         else:
             free = self._slots.over(place, times, sigma, guide.on_lanes())
-            reference = way = self._slots.over(place, times, sigma, guide)
-            # Raw measurements jump by more than what a taut way could gain.
-            share = 0.0
-            if nav.filtered:
-                reference = self._slots.over(place, times, sigma, guide.pulled())
-                along = self._frame.along_track
-                ahead = along(free[..., POSITION]) - along(place)[..., None]
-                share = self.problem.planner.cohesion * guide.loose_at(ahead)
+            way = self._slots.over(place, times, sigma, guide)
+            reference = way if guide.taut is None else self._slots.over(place, times, sigma, guide.pulled())
+            along = self._frame.along_track
+            ahead = along(free[..., POSITION]) - along(place)[..., None]
+            share = share * guide.loose_at(ahead)
         if carried is not None and len(self._lanes) > 1:
             reference = drawn_together(reference, free, carried[0], trusted, share, self._frame)
         return reference, way

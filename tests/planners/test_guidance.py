@@ -274,13 +274,52 @@ def test_turning_the_world_turns_the_guide() -> None:
     assert np.abs(plain.offset).max() > 2.0
 
 
+def test_between_plans_all_that_is_asked_moves_with_the_uav() -> None:
+    """Offsets, taut ways and how loose they are belong to places in the world, not to distances ahead."""
+    made = guidance([Cylinder((40.0, 3.0), 1.5)])
+    trusted, flown = np.ones((1, 4), dtype=bool), 0.6
+    place = advanced(20.0)
+    place[:, 0] = 2.0 * np.round(0.5 * place[:, 0])  # on the stations, so that the first guide is the plan
+    first = made.step(place[None], isotropic(0.5), trusted, 0.0, taut=True)
+    place = place + np.array([flown, 0.0, 0.0])
+    later = made.step(place[None], isotropic(0.5), trusted, 0.3, taut=True)
+    ahead = first.ahead_m
+    inside = ahead + flown <= ahead[-1]
+    assert first.loose is not None
+    assert first.taut is not None
+    assert later.loose is not None
+    assert later.taut is not None
+    assert first.loose.min() < 0.9
+    pairs = [(first.loose, later.loose)]
+    pairs += [(first.taut[..., a], later.taut[..., a]) for a in range(2)]
+    pairs += [(first.offset[..., a], later.offset[..., a]) for a in range(2)]
+    for at_first, at_last in pairs:
+        for uav in range(4):
+            expected = np.interp(ahead[inside] + flown, ahead, at_first[0, uav])
+            np.testing.assert_allclose(at_last[0, uav, inside], expected, atol=1e-9)
+
+
+def test_taut_ways_are_made_only_where_they_are_asked_for() -> None:
+    guide = guidance([]).step(SLOTS[None], isotropic(0.5), np.ones((1, 4), dtype=bool), 0.0)
+    assert guide.taut is None
+    assert guide.loose is None
+    assert guide.pulled() is guide
+
+
+def test_settings_may_be_whole_numbers() -> None:
+    """To the compiled search a whole number would be another type, and an error pages long."""
+    made = guidance([Cylinder((40.0, 3.0), 1.5)], GuidanceSettings(path=9, keep=1))
+    guide = made.step(advanced(20.0)[None], isotropic(0.5), np.ones((1, 4), dtype=bool), 0.0)
+    assert np.abs(guide.offset).max() > 1.0
+
+
 def test_what_is_not_trusted_does_not_reach_the_plan() -> None:
     made = guidance([Cylinder((40.0, 3.0), 1.5)])
     place, covariance = advanced(10.0)[None], isotropic(0.5)
-    before = made.step(place, covariance, np.ones((1, 4), dtype=bool), 0.0)
+    before = made.step(place, covariance, np.ones((1, 4), dtype=bool), 0.0, taut=True)
     place, covariance = place.copy(), covariance.copy()
     place[0, 2], covariance[0, 2] = np.nan, np.nan
-    after = made.step(place, covariance, np.array([[True, True, False, True]]), 0.4)
+    after = made.step(place, covariance, np.array([[True, True, False, True]]), 0.4, taut=True)
     for field in fields(Guide):
         assert np.isfinite(getattr(after, field.name)).all(), field.name
     np.testing.assert_allclose(after.offset, before.offset, atol=1.0)
