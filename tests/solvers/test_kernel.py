@@ -2,94 +2,25 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from exactness import relative_residuals as compiled_residuals
 from numpy.typing import NDArray
-from scipy.linalg import block_diag, solve_discrete_are
+from plain_active_set import PlainActiveSet
+from random_programs import GRID, INF, LONG_GRID, MODELS, hover_model, mixed
 
 from napf_mpc.constraints.constraint import LinearRows
-from napf_mpc.problem import Vehicle
-from napf_mpc.qp import SIGNALS, HorizonModel, HorizonQp, Layout, QpError, QpStatus
+from napf_mpc.qp import HorizonModel, HorizonQp, Layout, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult, WarmStart, make_batch_solver
 from napf_mpc.solvers.kernel_signals import signal_maps
 from napf_mpc.solvers.residuals import kkt_residuals
 from napf_mpc.solvers.solver import SolverError
-from napf_mpc.vehicle.quadrotor import discretize, hover_input, linearize, mixer_inverse, rotor_limit
 
 Array = NDArray[np.float64]
-VEHICLE = Vehicle()
-ROTORS = mixer_inverse(VEHICLE)
-ROTOR_LOW = -ROTORS @ hover_input(VEHICLE)
-ROTOR_HIGH = rotor_limit(VEHICLE) + ROTOR_LOW
-GRID = (0.1, 0.1, 0.1, 0.2, 0.4, 0.6)
-LONG_GRID = (0.1,) * 5 + (0.2,) * 5 + (0.4,) * 5 + (0.6,) * 5
 CODE = {status: code for code, status in enumerate(STATUSES)}
 SOLVED = CODE[QpStatus.SOLVED]
-INF = np.inf
-
-
-@functools.cache
-def hover_model(grid: tuple[float, ...] = GRID, yaw_rad: float = 0.0) -> HorizonModel:
-    step = np.array(grid)
-    pairs = [discretize(*linearize(VEHICLE, yaw_rad), float(s)) for s in step]
-    a, b = np.array([p[0] for p in pairs]), np.array([p[1] for p in pairs])
-    q = np.diag([1.0] * 7 + [0.2, 1.0, 0.2, 1.0, 0.2]) * step[:, None, None]
-    r = np.diag([0.1, 20.0, 20.0, 20.0]) * step[:, None, None]
-    q[-1] = solve_discrete_are(a[-1], b[-1], q[-1], r[-1])
-    q[-1] = 0.5 * (q[-1] + q[-1].T)
-    return HorizonModel(step, a, b, q, r)
-
-
-def mixed(
-    seed: int, runs: int = 2, uavs: int = 2, model: HorizonModel | None = None, far_m: float = 0.0
-) -> HorizonQp:
-    """All kinds of rows with random geometry and prices over four decades, some met, most not."""
-    rng = np.random.default_rng(seed)
-    model = hover_model() if model is None else model
-    shape = (runs, uavs, model.stages)
-    rough = rng.choice([0.1, 0.5, 2.0])
-    initial = rough * rng.normal(size=(*shape[:2], 12)) * np.array([1, 1] * 3 + [0.1, 0.1] * 3)
-    reference = np.zeros((*shape, 12))
-    reference[..., 0] = 2.0 * model.times_s
-    reference[..., 1] = 2.0
-    reference[..., :6:2] += rough * rng.normal(size=(*shape[:2], 1, 3))
-    initial[..., :6:2] += far_m
-    reference[..., :6:2] += far_m
-
-    def some(count: int, high: float = 3.0) -> Array:
-        return np.asarray(10.0 ** rng.uniform(0.0, high, size=(*shape, count)))
-
-    normal = rng.normal(size=(*shape, 4, 3))
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    gap = rng.uniform(-0.5, 3.0, size=(*shape, 4))
-    near = (normal * reference[..., None, :6:2]).sum(-1) - gap
-    near[rng.uniform(size=near.shape) < 0.4] = -INF
-    apart = rng.normal(size=(*shape, 2, 3))
-    keep = (apart * reference[..., None, :6:2]).sum(-1) - rng.uniform(0.0, 4.0, size=(*shape, 2))
-    speed = np.broadcast_to(rng.normal(size=(5, 3)), (*shape, 5, 3))
-    fast = np.full((*shape, 5), rng.uniform(1.0, 4.0))
-    lean = np.full((*shape, 2), rng.uniform(0.05, 0.4))
-    rows = (
-        LinearRows("position", normal, lower=near, w1=some(1), w2=some(1), shared_slack=True),
-        LinearRows("position", normal, lower=near + 1.5, w1=0.0 * some(4), w2=some(4, 2.0)),
-        LinearRows(
-            "position", apart, lower=keep, upper=keep + 9.0, w1=some(2), w2=some(2), shared_slack=False
-        ),
-        LinearRows("velocity", speed, -fast, fast, some(5), some(5)),
-        LinearRows("attitude", np.broadcast_to(np.eye(3)[:2], (*shape, 2, 3)), -lean, lean, some(2), some(2)),
-        LinearRows(
-            "input",
-            np.broadcast_to(ROTORS, (*shape, 4, 4)),
-            np.broadcast_to(ROTOR_LOW, (*shape, 4)),
-            np.broadcast_to(ROTOR_HIGH, (*shape, 4)),
-        ),
-    )
-    horizon = HorizonQp(model, initial, reference, rows)
-    horizon.check()
-    return horizon
 
 
 def relative_residuals(horizon: HorizonQp, result: BatchResult) -> Array:
@@ -102,7 +33,7 @@ def relative_residuals(horizon: HorizonQp, result: BatchResult) -> Array:
         finite = np.where(np.isfinite(program.lower), program.lower, 0.0)
         finite_up = np.where(np.isfinite(program.upper), program.upper, 0.0)
         value = abs(program.a) @ np.abs(z)
-        primal = max(1.0, np.abs(program.a.multiply(z[None]).toarray()).max(), np.abs(finite).max())
+        primal = max(1.0, np.abs(program.a.multiply(z[None]).toarray()).max())
         terms = (program.p.multiply(z[None]), program.a.multiply(y[:, None]))
         dual = max(1.0, np.abs(program.q).max(), *(float(abs(t).max()) for t in terms))
         product = max(
@@ -112,134 +43,18 @@ def relative_residuals(horizon: HorizonQp, result: BatchResult) -> Array:
     return out
 
 
-# --- The same method in plain NumPy -----------------------------------------------------------------------
-
-
-class Oracle:
-    """Goldfarb and Idnani on the condensed program of one UAV, with a dense solve for every step.
-
-    Rows are ``n' u + s >= bound``; a group's slack is zero while the group is closed.
-    """
-
-    def __init__(self, horizon: HorizonQp, run: int, uav: int) -> None:
-        model, stages = horizon.model, horizon.model.stages
-        moved, drift = np.zeros((stages, 12, 4 * stages)), np.zeros((stages, 12))
-        state, free = np.zeros((12, 4 * stages)), horizon.initial[run, uav]
-        for k in range(stages):
-            state, free = model.a[k] @ state, model.a[k] @ free
-            state[:, 4 * k : 4 * k + 4] += model.b[k]
-            moved[k], drift[k] = state, free
-        flat = moved.reshape(-1, 4 * stages)
-        hessian = flat.T @ block_diag(*model.q) @ flat + block_diag(*model.r)
-        pull = flat.T @ block_diag(*model.q) @ (drift - horizon.reference[run, uav]).ravel()
-        self.hessian, self.free = hessian, -np.linalg.solve(hessian, pull)
-        self.moved, self.drift = moved, drift
-        self.normals: list[Array] = []
-        self.bounds: list[float] = []
-        self.groups: list[int] = []
-        self.prices: list[tuple[float, float]] = []
-        for block in horizon.rows:
-            self._add(block, model, run, uav)
-
-    def _add(self, block: LinearRows, model: HorizonModel, run: int, uav: int) -> None:
-        places = np.array(SIGNALS[block.signal])
-        for k in range(model.stages):
-            signal = (
-                np.eye(4 * model.stages)[4 * k + places] if block.signal == "input" else self.moved[k, places]
-            )
-            offset = np.zeros(len(places)) if block.signal == "input" else self.drift[k, places]
-            first = len(self.prices)
-            if block.w1 is not None and block.w2 is not None:
-                both = zip(block.w1[run, uav, k], block.w2[run, uav, k], strict=True)
-                self.prices += [(w1 * model.step_s[k], w2 * model.step_s[k]) for w1, w2 in both]
-            for j, jac in enumerate(block.jac[run, uav, k]):
-                for sign, bound in ((1.0, block.lower), (-1.0, block.upper)):
-                    if bound is not None and np.isfinite(bound[run, uav, k, j]):
-                        self.normals.append(sign * jac @ signal)
-                        self.bounds.append(sign * (bound[run, uav, k, j] - jac @ offset))
-                        self.groups.append(
-                            -1 if not block.soft else first if block.shared_slack else first + j
-                        )
-
-    def solve(self) -> tuple[QpStatus, Array]:
-        """Status and inputs (4 N,)."""
-        if not self.normals:
-            return QpStatus.SOLVED, self.free
-        normals, bounds, groups = np.array(self.normals), np.array(self.bounds), np.array(self.groups)
-        response = np.linalg.solve(self.hessian, normals.T)
-        gram = normals @ response
-        w1 = np.array([w for w, _ in self.prices] + [INF])
-        w2 = np.array([w for _, w in self.prices] + [1.0])
-        is_open, mult, members = w1 <= 0.0, np.zeros(len(bounds)), []
-        for _ in range(2000):
-            total = np.bincount(groups % len(w1), mult, len(w1))
-            slack = np.where(is_open, (total - np.where(is_open, w1, 0.0)) / w2, 0.0)
-            violation = bounds - normals @ self.free - gram @ mult - slack[groups]
-            violation[members] = 0.0
-            row, group = int(violation.argmax()), int(slack.argmin())
-            if max(violation[row], -slack[group]) < 1e-10:
-                return QpStatus.SOLVED, self.free + response @ mult
-            closing = -slack[group] > violation[row]
-            group = group if closing else int(groups[row])
-            left = -slack[group] if closing else violation[row]
-            while True:
-                tie = (groups[:, None] == groups) * np.where(is_open, 1.0 / w2, 0.0)[groups]
-                whole = gram + tie
-                new = (groups[members] == group) / w2[group] if closing else whole[members, row]
-                size = 1.0 / w2[group] if closing else whole[row, row]
-                step = np.linalg.solve(whole[np.ix_(members, members)], new)
-                fresh = size - new @ step
-                change = np.zeros(len(bounds))
-                change[members] = -step
-                if not closing:
-                    change[row] = 1.0
-                rate = np.bincount(groups % len(w1), change, len(w1))
-                total = np.bincount(groups % len(w1), mult, len(w1))
-                lengths = [(left / fresh if fresh > 1e-10 * size else INF, "full", 0)]
-                lengths += [(mult[j] / -change[j], "drop", j) for j in members if change[j] < 0.0]
-                lengths += [
-                    ((w1[g] - total[g]) / rate[g], "open", g) for g in np.flatnonzero(~is_open & (rate > 0.0))
-                ]
-                length, event, which = min(lengths)
-                if length == INF:
-                    return QpStatus.PRIMAL_INFEASIBLE, self.free * np.nan
-                mult += length * change
-                left -= length * fresh
-                if event == "drop":
-                    members.remove(which)
-                    mult[which] = 0.0
-                elif event == "open":
-                    is_open[which] = True
-                else:
-                    break
-            if closing:
-                is_open[group] = False
-            else:
-                members.append(row)
-        return QpStatus.MAX_ITERATIONS, self.free * np.nan
-
-
 @pytest.mark.parametrize("seed", range(12))
 def test_the_method_in_plain_numpy_says_the_same(seed: int) -> None:
     horizon = mixed(seed, model=hover_model(GRID, 0.3 * (seed % 3)))
     result = make_batch_solver("kernel").solve_batch(horizon)
     for run, uav in np.ndindex(*result.status.shape):
-        status, inputs = Oracle(horizon, run, uav).solve()
+        status, inputs = PlainActiveSet(horizon, run, uav).solve()
         assert status is QpStatus.SOLVED
         assert result.status[run, uav] == SOLVED
         np.testing.assert_allclose(result.inputs[run, uav].ravel(), inputs, atol=1e-6)
 
 
 # --- Right answers ----------------------------------------------------------------------------------------
-
-MODELS = {
-    "uneven": (GRID, 0.0),
-    "planner": (LONG_GRID, 0.0),
-    "turned": (GRID, 0.7),
-    "even": ((0.1,) * 12, 0.0),
-    "one_stage": ((0.5,), 0.0),
-    "fine": ((0.05,) * 30, -2.0),
-}
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -261,6 +76,16 @@ def test_every_program_is_certified(name: str, far_m: float) -> None:
         assert relative_residuals(horizon, warm).max() < 1e-9
         assert warm.iterations.max() <= max(4, result.iterations.max() // 4)
         np.testing.assert_allclose(warm.inputs, result.inputs, atol=1e-6)
+
+
+def test_the_benchmark_measures_the_same_residuals() -> None:
+    horizon = mixed(3, 3, 2)
+    result = make_batch_solver("kernel").solve_batch(horizon)
+    for z, y in ((1.001, 1.0), (1.0, 0.99), (0.9, 2.0)):
+        off = replace(result, z=z * result.z, y=y * result.y)
+        expected = relative_residuals(horizon, off)
+        assert expected.min() > 1e-6
+        np.testing.assert_allclose(compiled_residuals(horizon, off), expected, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -605,7 +430,7 @@ def test_signal_kernel_is_what_a_force_does(yaw_rad: float) -> None:
     model = hover_model(GRID, yaw_rad)
     maps = signal_maps(model)
     n = model.stages
-    oracle = Oracle(HorizonQp(model, np.zeros((1, 1, 12)), np.zeros((1, 1, n, 12)), ()), 0, 0)
+    oracle = PlainActiveSet(HorizonQp(model, np.zeros((1, 1, 12)), np.zeros((1, 1, n, 12)), ()), 0, 0)
     signals = np.zeros((len(maps.stage), 4 * n))
     for i, (k, target) in enumerate(zip(maps.stage, maps.target, strict=True)):
         signals[i] = oracle.moved[k, target] if target < 12 else np.eye(4 * n)[4 * k + target - 12]

@@ -1,0 +1,211 @@
+"""How exact the kernel solver is: random programs of the planner's family by the hundred thousand.
+
+Run ``python benchmarks/exactness.py --programs 1000000``. Programs are those of random_programs.py: rows on
+position, velocity, attitude and inputs, soft ones with prices over decades, many that contradict each other.
+Every answer is certified from the program's plain matrices: each KKT residual over one or its largest term.
+The first ``--compared`` of every stage grid are solved by PIQP at 1e-12 as well, and
+the first ``--plain`` by the method written down in plain NumPy: first inputs are compared as parts of their
+range, and objectives relative to one or their own size. An answer of PIQP whose own certificate is worse than
+1e-9 compares nothing; it is counted apart.
+
+The exit code is 1 if any program failed or was less exact than the limits printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+from plain_active_set import PlainActiveSet
+from plant_speed import machine
+from random_programs import MODELS, ROTOR_HIGH, ROTOR_LOW, ROTORS, Array, hover_model, mixed
+
+from napf_mpc.campaign import versions
+from napf_mpc.jit import compiled
+from napf_mpc.qp import HorizonQp, Layout, QpStatus
+from napf_mpc.quadratic_program import Index
+from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, make_batch_solver
+
+SOLVED = STATUSES.index(QpStatus.SOLVED)
+EXACT = {"eps_abs": 1e-12, "eps_rel": 1e-12, "check_duality_gap": True}
+RUNS, UAVS = 64, 4
+RESIDUAL, INPUT, OBJECTIVE = 1e-9, 1e-6, 1e-8
+INPUT_RANGE = np.abs(np.linalg.inv(ROTORS)) @ (ROTOR_HIGH - ROTOR_LOW)
+"""(4,) widest span of each input [N, N m]."""
+
+
+def relative_residuals(horizon: HorizonQp, result: BatchResult) -> Array:
+    """(run, uav) largest KKT residual, each over one or its own largest term, from the plain matrices."""
+    layout = Layout.of(horizon)
+    sparsity, values = layout.sparsity, layout.values(horizon)
+    out = np.empty(result.status.shape)
+    for run, uav in np.ndindex(*out.shape):
+        out[run, uav] = _relative(
+            sparsity.p_starts, sparsity.p_rows, sparsity.a_starts, sparsity.a_rows, values.p[run, uav],
+            values.q[run, uav], values.a[run, uav], values.lower[run, uav], values.upper[run, uav],
+            result.z[run, uav], result.y[run, uav],
+        )  # fmt: skip
+    return out
+
+
+@compiled
+def _relative(
+    p_starts: Index, p_rows: Index, a_starts: Index, a_rows: Index,
+    p: Array, q: Array, a: Array, lower: Array, upper: Array, z: Array, y: Array,
+) -> float:  # fmt: skip
+    rows, sizes = np.zeros(len(y)), np.zeros(len(y))
+    dual, dual_term, primal_term = 0.0, 1.0, 1.0
+    for j in range(len(z)):
+        gradient = q[j]
+        dual_term = max(dual_term, abs(q[j]))
+        for k in range(p_starts[j], p_starts[j + 1]):
+            term = p[k] * z[p_rows[k]]
+            gradient += term
+            dual_term = max(dual_term, abs(term))
+        for k in range(a_starts[j], a_starts[j + 1]):
+            term = a[k] * y[a_rows[k]]
+            gradient += term
+            dual_term = max(dual_term, abs(term))
+            value = a[k] * z[j]
+            rows[a_rows[k]] += value
+            sizes[a_rows[k]] += abs(value)
+            primal_term = max(primal_term, abs(value))
+        if not np.isfinite(gradient):
+            return np.inf
+        dual = max(dual, abs(gradient))
+    primal, product, product_term = 0.0, 0.0, 1.0
+    for r in range(len(y)):
+        low = abs(lower[r]) if np.isfinite(lower[r]) else 0.0
+        high = abs(upper[r]) if np.isfinite(upper[r]) else 0.0
+        over, under = rows[r] - upper[r], lower[r] - rows[r]
+        primal = max(primal, over, under)
+        gap = over if y[r] > 0.0 else under
+        product = max(product, abs(y[r]) * (abs(gap) if np.isfinite(gap) else 1.0))
+        product_term = max(product_term, abs(y[r]) * max(sizes[r], low, high))
+    return max(primal / primal_term, dual / dual_term, product / product_term)
+
+
+@dataclass
+class Compared:
+    """Differences to another method's answers."""
+
+    count: int = 0
+    unusable: int = 0
+    """Answers of the other that prove nothing."""
+    first_input: float = 0.0
+    """Largest difference over the input's range."""
+    objective: float = 0.0
+    """Largest relative difference by which the kernel's objective is the worse one."""
+
+    def add(self, mine: Array, theirs: Array) -> None:
+        """First inputs (4,)."""
+        self.count += 1
+        self.first_input = max(self.first_input, float((np.abs(mine - theirs) / INPUT_RANGE).max()))
+
+
+@dataclass
+class Findings:
+    """Of one stage grid."""
+
+    programs: int = 0
+    failed: int = 0
+    worst: float = 0.0
+    """Largest relative KKT residual of those solved."""
+    short: int = 0
+    """Solved, and above the limit."""
+    cpu_s: float = 0.0
+    """Thread-CPU time of the solver."""
+    piqp: Compared = field(default_factory=Compared)
+    plain: Compared = field(default_factory=Compared)
+
+    @property
+    def sound(self) -> bool:
+        """Whether all limits were kept."""
+        near = all(c.first_input <= INPUT and c.objective <= OBJECTIVE for c in (self.piqp, self.plain))
+        return self.failed == 0 and self.short == 0 and near
+
+
+def compare(horizon: HorizonQp, mine: BatchResult, other: BatchSolver, count: int, found: Compared) -> None:
+    """Show the first ``count`` programs to PIQP too."""
+    theirs = other.solve_batch(horizon)
+    certified = relative_residuals(horizon, theirs)
+    for run, uav in list(np.ndindex(*mine.status.shape))[:count]:
+        if theirs.status[run, uav] != SOLVED or not certified[run, uav] <= RESIDUAL:
+            found.unusable += 1
+            continue
+        program = horizon.assemble(run, uav)
+        ours, best = (program.objective(r.z[run, uav]) for r in (mine, theirs))
+        found.objective = max(found.objective, (ours - best) / max(1.0, abs(best)))
+        found.add(mine.inputs[run, uav, 0], theirs.inputs[run, uav, 0])
+
+
+def examine(grid: str, programs: int, compared: int, plain: int, seed: int) -> Findings:
+    """Solve programs of one stage grid and certify all answers."""
+    model, found = hover_model(*MODELS[grid]), Findings()
+    solver = make_batch_solver("kernel")
+    piqp = make_batch_solver("piqp", **EXACT) if compared else None
+    while found.programs < programs:
+        horizon = mixed(seed, RUNS, UAVS, model)
+        began = time.thread_time()
+        result = solver.solve_batch(horizon)
+        found.cpu_s += time.thread_time() - began
+        solved = result.status == SOLVED
+        residual = relative_residuals(horizon, result)[solved]
+        left = found.programs
+        found.programs += solved.size
+        found.failed += int((~solved).sum())
+        found.short += int((~(residual <= RESIDUAL)).sum())
+        found.worst = max(found.worst, float(residual.max(initial=0.0)))
+        if piqp is not None and left < compared:
+            compare(horizon, result, piqp, compared - left, found.piqp)
+        for run, uav in list(np.ndindex(*solved.shape))[: max(0, plain - left)]:
+            status, inputs = PlainActiveSet(horizon, run, uav).solve()
+            if status is QpStatus.SOLVED:
+                found.plain.add(result.inputs[run, uav, 0], inputs[:4])
+            else:
+                found.plain.unusable += 1
+        seed += 1
+    return found
+
+
+def main() -> int:
+    """Examine all stage grids and print a row for each."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--programs", type=int, default=60_000, help="in all")
+    parser.add_argument("--compared", type=int, default=200, help="of each grid, with PIQP")
+    parser.add_argument("--plain", type=int, default=200, help="of each grid, with plain NumPy")
+    parser.add_argument("--seed", type=int, default=10_000)
+    options = parser.parse_args()
+    print(machine(), platform.python_version(), versions())
+    print(f"limits: residual {RESIDUAL:g}, first input {INPUT:g} of its range, objective {OBJECTIVE:g}")
+    print("| grid | stages | programs | failed | above the limit | worst residual | us each, cold ", end="")
+    print("| PIQP: compared (unusable) | input | objective | plain NumPy: compared (unusable) | input |")
+    print("|" + "---|" * 12)
+    sound, total = True, 0
+    for n, grid in enumerate(MODELS):
+        # Programs of different grids do not share their random numbers either.
+        found = examine(
+            grid, -(-options.programs // len(MODELS)), options.compared, options.plain,
+            options.seed + 1_000_000 * n,
+        )  # fmt: skip
+        print(
+            f"| {grid} | {len(MODELS[grid][0])} | {found.programs} | {found.failed} | {found.short} "
+            f"| {found.worst:.1e} | {1e6 * found.cpu_s / found.programs:.0f} "
+            f"| {found.piqp.count} ({found.piqp.unusable}) | {found.piqp.first_input:.1e} "
+            f"| {found.piqp.objective:.1e} | {found.plain.count} ({found.plain.unusable}) "
+            f"| {found.plain.first_input:.1e} |",
+            flush=True,
+        )
+        sound &= found.sound
+        total += found.programs
+    print(f"{total} programs: " + ("all limits kept" if sound else "LIMITS NOT KEPT"))
+    return 0 if sound else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
