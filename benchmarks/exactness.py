@@ -24,10 +24,9 @@ from plant_speed import machine
 from random_programs import MODELS, ROTOR_HIGH, ROTOR_LOW, ROTORS, Array, hover_model, mixed
 
 from napf_mpc.campaign import versions
-from napf_mpc.jit import compiled
 from napf_mpc.qp import HorizonQp, Layout, QpStatus
-from napf_mpc.quadratic_program import Index
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, make_batch_solver
+from napf_mpc.solvers.residuals import relative_residuals
 
 SOLVED = STATUSES.index(QpStatus.SOLVED)
 EXACT = {"eps_abs": 1e-12, "eps_rel": 1e-12, "check_duality_gap": True}
@@ -37,55 +36,10 @@ INPUT_RANGE = np.abs(np.linalg.inv(ROTORS)) @ (ROTOR_HIGH - ROTOR_LOW)
 """(4,) widest span of each input [N, N m]."""
 
 
-def relative_residuals(horizon: HorizonQp, result: BatchResult) -> Array:
-    """(run, uav) largest KKT residual, each over one or its own largest term, from the plain matrices."""
+def certified(horizon: HorizonQp, result: BatchResult) -> Array:
+    """(run, uav) largest relative KKT residual of the answers, from the plain matrices."""
     layout = Layout.of(horizon)
-    sparsity, values = layout.sparsity, layout.values(horizon)
-    out = np.empty(result.status.shape)
-    for run, uav in np.ndindex(*out.shape):
-        out[run, uav] = _relative(
-            sparsity.p_starts, sparsity.p_rows, sparsity.a_starts, sparsity.a_rows, values.p[run, uav],
-            values.q[run, uav], values.a[run, uav], values.lower[run, uav], values.upper[run, uav],
-            result.z[run, uav], result.y[run, uav],
-        )  # fmt: skip
-    return out
-
-
-@compiled
-def _relative(
-    p_starts: Index, p_rows: Index, a_starts: Index, a_rows: Index,
-    p: Array, q: Array, a: Array, lower: Array, upper: Array, z: Array, y: Array,
-) -> float:  # fmt: skip
-    rows, sizes = np.zeros(len(y)), np.zeros(len(y))
-    dual, dual_term, primal_term = 0.0, 1.0, 1.0
-    for j in range(len(z)):
-        gradient = q[j]
-        dual_term = max(dual_term, abs(q[j]))
-        for k in range(p_starts[j], p_starts[j + 1]):
-            term = p[k] * z[p_rows[k]]
-            gradient += term
-            dual_term = max(dual_term, abs(term))
-        for k in range(a_starts[j], a_starts[j + 1]):
-            term = a[k] * y[a_rows[k]]
-            gradient += term
-            dual_term = max(dual_term, abs(term))
-            value = a[k] * z[j]
-            rows[a_rows[k]] += value
-            sizes[a_rows[k]] += abs(value)
-            primal_term = max(primal_term, abs(value))
-        if not np.isfinite(gradient):
-            return np.inf
-        dual = max(dual, abs(gradient))
-    primal, product, product_term = 0.0, 0.0, 1.0
-    for r in range(len(y)):
-        low = abs(lower[r]) if np.isfinite(lower[r]) else 0.0
-        high = abs(upper[r]) if np.isfinite(upper[r]) else 0.0
-        over, under = rows[r] - upper[r], lower[r] - rows[r]
-        primal = max(primal, over, under)
-        gap = over if y[r] > 0.0 else under
-        product = max(product, abs(y[r]) * (abs(gap) if np.isfinite(gap) else 1.0))
-        product_term = max(product_term, abs(y[r]) * max(sizes[r], low, high))
-    return max(primal / primal_term, dual / dual_term, product / product_term)
+    return relative_residuals(layout.sparsity, layout.values(horizon), result.z, result.y)
 
 
 @dataclass
@@ -131,9 +85,9 @@ class Findings:
 def compare(horizon: HorizonQp, mine: BatchResult, other: BatchSolver, count: int, found: Compared) -> None:
     """Show the first ``count`` programs to PIQP too."""
     theirs = other.solve_batch(horizon)
-    certified = relative_residuals(horizon, theirs)
+    residual = certified(horizon, theirs)
     for run, uav in list(np.ndindex(*mine.status.shape))[:count]:
-        if theirs.status[run, uav] != SOLVED or not certified[run, uav] <= RESIDUAL:
+        if theirs.status[run, uav] != SOLVED or not residual[run, uav] <= RESIDUAL:
             found.unusable += 1
             continue
         program = horizon.assemble(run, uav)
@@ -153,7 +107,7 @@ def examine(grid: str, programs: int, compared: int, plain: int, seed: int) -> F
         result = solver.solve_batch(horizon)
         found.cpu_s += time.thread_time() - began
         solved = result.status == SOLVED
-        residual = relative_residuals(horizon, result)[solved]
+        residual = certified(horizon, result)[solved]
         left = found.programs
         found.programs += solved.size
         found.failed += int((~solved).sum())

@@ -1,25 +1,20 @@
-"""Sequences of horizon programs for benchmarks of solvers: of the planner's own flights, and of plain ones.
+"""Sequences of horizon programs without the planner, for benchmarks of solvers.
 
-:func:`fly` is not the planner: rows and noise are made here from a few lines, so that solvers can be timed on
-programs of the planner's size and kind without it. :func:`flown` are the programs of closed-loop missions, as
-the planner shows them to its solver.
+Rows and noise are made here from a few lines, so that solvers can be timed on programs of the planner's size
+and kind without it; those of the planner's own flights are in :mod:`napf_mpc.benchmark.programs`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from napf_mpc.closed_loop import build_scenario, closed_loop
 from napf_mpc.constraints.constraint import LinearRows
-from napf_mpc.planners.mpc import QpPlanner
 from napf_mpc.problem import Vehicle
-from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import Array, HorizonModel, HorizonQp
-from napf_mpc.solvers.batch import BatchResult, Mask, WarmStart, make_batch_solver
 from napf_mpc.vehicle.quadrotor import (
     ATTITUDE,
     POSITION,
@@ -178,70 +173,3 @@ def _rows(
             upper=np.broadcast_to(limit.upper, (*shape, 4)),
         ),
     )
-
-
-@dataclass(frozen=True)
-class Step:
-    """What the planner shows its solver at one step."""
-
-    horizon: HorizonQp
-    warm: WarmStart | None
-    active: Mask
-    """(run,) runs still flying."""
-
-    @property
-    def programs(self) -> int:
-        """How many are to be solved."""
-        return int(self.active.sum()) * self.horizon.shape[1]
-
-    def of_one(self, run: int, uav: int) -> Step:
-        """The same of one UAV."""
-        at = (slice(run, run + 1), slice(uav, uav + 1))
-
-        def own(values: Array | None) -> Array | None:
-            return None if values is None else np.ascontiguousarray(values[at])
-
-        full = self.horizon
-        rows = tuple(
-            replace(
-                b, jac=np.ascontiguousarray(b.jac[at]), lower=own(b.lower), upper=own(b.upper),
-                w1=own(b.w1), w2=own(b.w2),
-            )
-            for b in full.rows
-        )  # fmt: skip
-        horizon = HorizonQp(full.model, full.initial[at].copy(), full.reference[at].copy(), rows)
-        warm = None if self.warm is None else WarmStart(self.warm.z[at].copy(), self.warm.y[at].copy())
-        return Step(horizon, warm, np.ones(1, dtype=bool))
-
-
-class _Recorder:
-    """A solver that keeps one step in every so many."""
-
-    def __init__(self, every: int) -> None:
-        self._solver, self._every, self._seen = make_batch_solver("kernel"), every, 0
-        self.steps: list[Step] = []
-
-    def reset(self) -> None:
-        """Forget all workspaces."""
-        self._solver.reset()
-
-    def solve_batch(
-        self, horizon: HorizonQp, warm: WarmStart | None = None, active: Mask | None = None
-    ) -> BatchResult:
-        """Answer of the solver."""
-        if self._seen % self._every == self._every - 1:
-            asked = np.ones(horizon.shape[0], dtype=bool) if active is None else active.copy()
-            self.steps.append(Step(horizon, warm, asked))
-        self._seen += 1
-        return self._solver.solve_batch(horizon, warm, active)
-
-
-def flown(name: str, *, missions: int, every: int, seed: int) -> list[Step]:
-    """One step in every so many of closed-loop missions of a shipped problem, behind a navigation filter."""
-    problem = load_problem(name)
-    problem = problem.model_copy(
-        update={"navigation": problem.navigation.model_copy(update={"filter": "kalman"})}
-    )
-    recorder = _Recorder(every)
-    closed_loop(problem, QpPlanner(problem, solver=recorder), build_scenario(problem, seed, range(missions)))
-    return [step for step in recorder.steps if step.programs]

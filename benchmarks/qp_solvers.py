@@ -5,12 +5,7 @@ Times are thread-CPU times of a whole step (assembly, checks, solve, residuals),
 worst single UAV is slower than the worst step. All solvers get the same programs, made by a flight on exact
 answers; warm starts are the solver's own last answer, re-sampled.
 
-A second table is of the planner's own closed-loop missions (``--missions``): one step in every ``--every`` is
-shown once to the kernel solver, to OSQP with its workspaces kept, and to PIQP, in turn, so that whatever else
-the machine does falls on all alike. All get the flight's own warm start; PIQP has no use for it. "Together"
-is the time of a step of all missions over its programs, of which quantiles are over steps: the worst single
-program is slower. "Alone" is that of a call for one program, where the fixed cost of a call is shared with
-nobody. Below stand the ratios to the kernel solver.
+Programs of the planner's own missions, with more contenders, are timed by ``napf-mpc benchmark solvers``.
 """
 
 from __future__ import annotations
@@ -23,7 +18,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
-from horizon_sequence import Step, flown, fly, horizon_model, resampled, rotors
+from horizon_sequence import fly, horizon_model, resampled, rotors
 from plant_speed import machine
 
 from napf_mpc.problem import Vehicle
@@ -93,54 +88,10 @@ def timed(way: Way, horizons: list[HorizonQp]) -> tuple[Array, list[BatchResult]
     return np.array(seconds[1:]), answers
 
 
-FLOWN = (("moderate", "study_8s"), ("moderate", "study_40s"), ("dense", "study_40c"))
-"""Clutter, and shipped problem."""
-RIVALS = ("kernel", "osqp", "piqp")
-
-
-def microseconds(solver: BatchSolver, step: Step) -> float:
-    """Thread-CPU time of a step over its programs."""
-    start = time.thread_time()
-    solver.solve_batch(step.horizon, step.warm, step.active)
-    return (time.thread_time() - start) * 1e6 / step.programs
-
-
-def print_flown(missions: int, every: int, seed: int) -> None:
-    """Time the planner's own programs."""
-    print(f"\n{missions} missions, one step in {every}; thread-CPU microseconds per program, by step")
-    head = "".join(
-        f"{way + ' ' + of:>15}" for way in ("together", "alone") for of in ("median", "p99", "max")
-    )
-    print(f"{'problem':<24}{'solver':<16}{head}")
-    for clutter, name in FLOWN:
-        steps = flown(name, missions=missions, every=every, seed=seed)
-        solvers = {rival: (make_batch_solver(rival), make_batch_solver(rival)) for rival in RIVALS}
-        spent: dict[str, tuple[list[float], list[float]]] = {rival: ([], []) for rival in RIVALS}
-        for step in steps:
-            one = step.of_one(int(np.flatnonzero(step.active)[0]), 0)
-            for rival, (many, single) in solvers.items():
-                spent[rival][0].append(microseconds(many, step))
-                spent[rival][1].append(microseconds(single, one))
-        table = {
-            rival: np.concatenate([np.quantile(np.array(times[1:]), [0.5, 0.99, 1.0]) for times in both])
-            for rival, both in spent.items()
-        }
-        for rival, numbers in table.items():
-            title = f"{name} ({clutter})" if rival == RIVALS[0] else ""
-            print(f"{title:<24}{rival:<16}" + "".join(f"{number:>15.1f}" for number in numbers))
-        for rival in RIVALS[1:]:
-            ratios = table[rival] / table[RIVALS[0]]
-            print(f"{'':<24}{rival + ' / kernel':<16}" + "".join(f"{ratio:>15.1f}" for ratio in ratios))
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--steps", type=int, default=150, help="steps of 0.1 s in each scene")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--missions", type=int, default=16, help="closed-loop missions, 0 for none")
-    parser.add_argument(
-        "--every", type=int, default=24, help="steps between those of a mission that are timed"
-    )
     arguments = parser.parse_args()
     if arguments.steps < 2:
         parser.error("steps must be 2 or more")
@@ -148,8 +99,6 @@ def main() -> int:
     print(machine())
     packages = ("numpy", "osqp", "qpsolvers", "piqp", "daqp", "clarabel")
     print(f"python {platform.python_version()}, " + ", ".join(f"{name} {version(name)}" for name in packages))
-    if arguments.missions:
-        print_flown(arguments.missions, arguments.every, arguments.seed)
     limit = rotors(Vehicle())
     limits = AcceptanceLimits.of(horizon_model(Vehicle()), limit.matrix, limit.lower, limit.upper)
     print(

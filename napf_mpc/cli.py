@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -17,6 +17,8 @@ from napf_mpc.errors import NapfError, ProblemError
 if TYPE_CHECKING:
     from napf_mpc.problem import Problem
     from napf_mpc.report import Rows
+
+T = TypeVar("T")
 
 app = typer.Typer(
     name="napf-mpc",
@@ -246,6 +248,45 @@ def figures(
         return
     for path in paths:
         _say(str(path), quiet)
+
+
+@app.command()
+def benchmark(
+    what: Annotated[Literal["solvers"], typer.Argument(help="What to measure on this machine.")],
+    out: Out = None,
+    scenes: Annotated[str | None, typer.Option(help="Scenes, with semicolons (default: all).")] = None,
+    contenders: Annotated[
+        str | None, typer.Option("--solvers", help="Solvers, with semicolons (default: all).")
+    ] = None,
+    missions: Annotated[int, typer.Option(min=1, max=1000, help="Missions flown in each scene.")] = 8,
+    every: Annotated[int, typer.Option(min=1, help="Steps of a mission from one timed to the next.")] = 20,
+    seed: Seed = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Time solvers on the programs of closed-loop missions, and check what they claim."""
+    from napf_mpc.benchmark.contenders import CONTENDERS, SCENES
+    from napf_mpc.benchmark.run import benchmark_solvers
+
+    chosen_scenes, chosen = _chosen("scenes", scenes, SCENES), _chosen("solvers", contenders, CONTENDERS)
+    shown, paths = benchmark_solvers(
+        chosen_scenes, chosen, missions, every, seed, out, lambda words: _say(words, quiet)
+    )  # fmt: skip
+    for table in shown:
+        _show(table, quiet)
+    for path in paths:
+        _say(str(path), quiet)
+
+
+def _chosen(option: str, given: str | None, known: Mapping[str, T]) -> dict[str, T]:
+    """Entries by their labels, which may contain commas."""
+    if given is None:
+        return dict(known)
+    labels = [label.strip() for label in given.split(";") if label.strip()]
+    unknown = [label for label in labels if label not in known]
+    if unknown or not labels:
+        what = f"does not know {unknown[0]!r}" if unknown else "names nothing"
+        raise ProblemError(f"--{option}", [f"{what}; choose from {'; '.join(known)}"])
+    return {label: known[label] for label in labels}
 
 
 def _campaign(

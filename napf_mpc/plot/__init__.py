@@ -8,6 +8,7 @@ from napf_mpc.plot.compare import compare_figures
 from napf_mpc.plot.flight import run_figures
 from napf_mpc.plot.overview import Mission, paths_overview, pick_missions
 from napf_mpc.plot.paper import paper_figures
+from napf_mpc.plot.solvers import draw_solvers
 from napf_mpc.plot.trade import draw_fronts
 
 __all__ = [
@@ -15,6 +16,7 @@ __all__ = [
     "animation",
     "compare_figures",
     "draw_fronts",
+    "draw_solvers",
     "paper_figures",
     "paths_overview",
     "pick_missions",

@@ -1,0 +1,1 @@
+"""Benchmarks that users run themselves: solvers on the programs of the planner's own flights."""

@@ -1,0 +1,230 @@
+"""Solvers on the same programs: time, what they claim, and what of it is true.
+
+A program is shown to all contenders one after the other, in an order that moves on from program to program,
+so that whatever else the machine does falls on all alike. Time is that of a whole call: assembly, checks,
+solve, residuals. *Alone* is a call for one program; *together* one for all of a step, over their number.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binom
+
+from napf_mpc.benchmark.contenders import (
+    OSQP,
+    REFERENCE,
+    REFERENCE_SETTINGS,
+    Contender,
+    Scene,
+)
+from napf_mpc.benchmark.programs import Step, flown
+from napf_mpc.problem import Problem
+from napf_mpc.problem_file import load_problem
+from napf_mpc.qp import Array, HorizonQp, Layout, QpStatus
+from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, make_batch_solver
+from napf_mpc.solvers.residuals import relative_residuals
+from napf_mpc.solvers.solver import SolverError
+from napf_mpc.vehicle.quadrotor import mixer_inverse, rotor_limit
+
+SOLVED = STATUSES.index(QpStatus.SOLVED)
+CORRECT = 1e-3
+"""A first input is correct if it is no farther than this part of its range from the reference."""
+ALONE, TOGETHER = "alone", "together"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One contender on one program, or on all programs of a step."""
+
+    scene: str
+    contender: str
+    calls: str
+    """:data:`ALONE` or :data:`TOGETHER`."""
+    step: int
+    """Which of the scene's."""
+    programs: int
+    """In the call."""
+    claimed: int
+    """Programs that the solver calls solved."""
+    correct: int
+    """Programs whose first input is that of the reference, whatever the solver says."""
+    residual: float
+    """Largest KKT residual, each over one or its largest term."""
+    input_error: float
+    """Largest difference of a first input to the reference, as part of its range."""
+    cpu_us: float
+    """Thread-CPU time a program."""
+    wall_us: float
+    """Wall time a program."""
+
+
+def measure(
+    scenes: Mapping[str, Scene],
+    contenders: Mapping[str, Contender],
+    *,
+    missions: int = 8,
+    every: int = 20,
+    seed: int = 0,
+    tell: Callable[[str], None] = lambda words: None,
+) -> list[Row]:
+    """All contenders on the programs of all scenes.
+
+    Parameters
+    ----------
+    scenes, contenders : mapping
+        By label, such as :data:`~.contenders.SCENES` and :data:`~.contenders.CONTENDERS`.
+    missions, every, seed : int
+        Of the flights, see :func:`~.programs.flown`.
+    tell : callable
+        Told what is done, and which contenders are not installed.
+
+    Returns
+    -------
+    list of Row
+        The first step of each scene is left out: it pays for what is done once.
+    """
+    present = {}
+    for label, contender in contenders.items():
+        try:
+            contender.make()
+            present[label] = contender
+        except SolverError as error:
+            tell(f"{label} is left out: {error}")
+    reference = make_batch_solver(REFERENCE, **REFERENCE_SETTINGS)
+    rows: list[Row] = []
+    for label, scene in scenes.items():
+        problem = load_problem(scene.problem, {"navigation.filter": "kalman", **scene.overrides})
+        steps = flown(problem, missions=missions, every=every, seed=seed)
+        tell(f"{label}: {len(steps)} steps, {sum(step.programs for step in steps)} programs")
+        rows += _of_scene(label, problem, steps, present, reference)
+    return rows
+
+
+def _of_scene(
+    label: str,
+    problem: Problem,
+    steps: Sequence[Step],
+    contenders: Mapping[str, Contender],
+    reference: BatchSolver,
+) -> Iterator[Row]:
+    span = np.abs(np.linalg.inv(mixer_inverse(problem.vehicle))).sum(1) * rotor_limit(problem.vehicle)
+    solvers = {name: {ALONE: c.make(), TOGETHER: c.make()} for name, c in contenders.items()}
+    names = list(contenders)
+    reference.reset()
+    for number, step in enumerate(steps):
+        runs = np.flatnonzero(step.active)
+        one = step.of_one(int(runs[number % len(runs)]), number % step.horizon.shape[1])
+        first = number % len(names)
+        for calls, shown in ((ALONE, one), (TOGETHER, step)):
+            truth = reference.solve_batch(shown.horizon, None, shown.active)
+            rows = {}
+            for name in names[first:] + names[:first]:
+                contender = contenders[name]
+                solver = solvers[name][calls]
+                if not contender.keep:
+                    solver.reset()
+                answer, cpu, wall = _timed(solver, shown if contender.warm else shown.cold())
+                off = _input_error(answer, truth, span)[shown.active]
+                rows[name] = Row(
+                    label, name, calls, number, shown.programs,
+                    int((answer.status[shown.active] == SOLVED).sum()), int((off <= CORRECT).sum()),
+                    float(_residual(shown.horizon, answer)[shown.active].max()), float(off.max()),
+                    1e6 * cpu / shown.programs, 1e6 * wall / shown.programs,
+                )  # fmt: skip
+            if number > 0:
+                yield from (rows[name] for name in names)
+
+
+def _timed(solver: BatchSolver, step: Step) -> tuple[BatchResult, float, float]:
+    """Answer, thread-CPU and wall time [s]; collecting garbage is nobody's part."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        wall, cpu = time.perf_counter(), time.thread_time()
+        answer = solver.solve_batch(step.horizon, step.warm, step.active)
+        return answer, time.thread_time() - cpu, time.perf_counter() - wall
+    finally:
+        if collects:
+            gc.enable()
+
+
+def _input_error(answer: BatchResult, truth: BatchResult, span: Array) -> Array:
+    """(run, uav) of first inputs, as part of their range; infinite without an answer."""
+    off = np.abs(answer.inputs[:, :, 0] - truth.inputs[:, :, 0]) / span
+    return np.asarray(np.where(np.isfinite(off), off, np.inf).max(-1))
+
+
+def _residual(horizon: HorizonQp, answer: BatchResult) -> Array:
+    layout = Layout.of(horizon)
+    return relative_residuals(layout.sparsity, layout.values(horizon), answer.z, answer.y)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """One contender in one scene, program by program (alone), and its time in a batch."""
+
+    scene: str
+    contender: str
+    programs: int
+    claimed: int
+    correct: int
+    residual: float
+    input_error: float
+    median_us: float
+    p95_us: float
+    p99_us: float
+    max_us: float
+    together_us: float
+    """Median over steps."""
+    alone_gain: tuple[float, float, float]
+    """OSQP's time over this one's, program by program: median and its 95 % interval."""
+    together_gain: tuple[float, float, float]
+    """The same, step by step."""
+
+
+def summaries(rows: Sequence[Row]) -> list[Summary]:
+    """Per scene and contender; thread-CPU times. Failed answers count with the time they took."""
+    of: dict[tuple[str, str, str], list[Row]] = {}
+    for row in rows:
+        of.setdefault((row.scene, row.contender, row.calls), []).append(row)
+    out = []
+    for (scene, contender, calls), alone in of.items():
+        if calls != ALONE:
+            continue
+        batch = of[scene, contender, TOGETHER]
+        everything = [*alone, *batch]
+        times = np.array([row.cpu_us for row in alone])
+        median, p95, p99, most = np.quantile(times, [0.5, 0.95, 0.99, 1.0]).tolist()
+        out.append(
+            Summary(
+                scene,
+                contender,
+                sum(row.programs for row in everything),
+                sum(row.claimed for row in everything),
+                sum(row.correct for row in everything),
+                max(row.residual for row in everything),
+                max(row.input_error for row in everything),
+                median,
+                p95,
+                p99,
+                most,
+                float(np.median([row.cpu_us for row in batch])),
+                _gain(of.get((scene, OSQP, ALONE)), alone),
+                _gain(of.get((scene, OSQP, TOGETHER)), batch),
+            )
+        )
+    return out
+
+
+def _gain(rival: Sequence[Row] | None, mine: Sequence[Row]) -> tuple[float, float, float]:
+    """Median of the rival's times over mine, step by step, with the interval of its order statistics."""
+    if rival is None:
+        return np.nan, np.nan, np.nan
+    ratio = np.sort([theirs.cpu_us / own.cpu_us for theirs, own in zip(rival, mine, strict=True)])
+    rank = max(int(binom.ppf(0.025, len(ratio), 0.5)), 1)
+    return float(np.median(ratio)), float(ratio[rank - 1]), float(ratio[-rank])
