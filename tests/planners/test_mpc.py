@@ -298,10 +298,20 @@ def test_a_filtered_estimate_follows_the_taut_way_and_raw_measurements_the_guide
         np.zeros((1, 4)), 0.25 * offset, np.zeros((1, 4, 49)),
     )  # fmt: skip
     raw = nav(slots, sigma_m=0.0)
-    everybody = raw.trusted()
-    for solution, expected in ((raw, 2.0), (replace(raw, filtered=True), 0.5)):
-        state = planner._state(solution, everybody)
-        reference, way = planner._references(state, None, solution, everybody, guide)
+    everybody, asked = raw.trusted(), []
+    for solution in (raw, replace(raw, filtered=True)):
+
+        def step(*_: object, taut: bool, shown: Guide = guide) -> Guide:
+            asked.append(taut)
+            return shown if taut else replace(shown, taut=None, loose=None)
+
+        assert planner._guidance is not None
+        planner._guidance.step = step  # type: ignore[method-assign, assignment]
+        planner.step(solution, 0.0)
+    assert asked == [False, True]
+    for given, expected in ((replace(guide, taut=None, loose=None), 2.0), (guide, 0.5)):
+        state = planner._state(raw, everybody)
+        reference, way = planner._references(state, None, raw, everybody, given)
         np.testing.assert_allclose(reference[0, :, :, 2] - slots[0, :, None, 1], expected, atol=1e-9)
         np.testing.assert_allclose(way[0, :, :, 2] - slots[0, :, None, 1], 2.0, atol=1e-9)
 
