@@ -52,7 +52,7 @@ def solvers_figure(
         Printed below.
     """
     rows = -(-len(times) // 4)
-    page = Page.of_size(PAGE_IN, BOTTOM_IN + TALL_IN + 0.16 * rows + 0.2, note)
+    page = Page.of_size(PAGE_IN, BOTTOM_IN + TALL_IN + 0.16 * rows + 0.32, note)
     width = (PAGE_IN - LEFT_IN - RIGHT_IN - GAP_IN) / 2.0
     left = page.axes(LEFT_IN, BOTTOM_IN, width, TALL_IN)
     right = page.axes(LEFT_IN + width + GAP_IN, BOTTOM_IN, width, TALL_IN, sharey=left)
@@ -66,10 +66,7 @@ def solvers_figure(
         _steps(right, values, colour, dash)
         handles.append(Line2D([], [], label=name, color=colour, linestyle=dash))
     right.axvline(1e6 * period_s, color=GREY, linewidth=0.8)
-    right.text(
-        1e6 * period_s, 0.02, f"period \n{1e3 * period_s:.0f} ms ", color=GREY, va="bottom", ha="right",
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
-    )  # fmt: skip
+    right.text(1e6 * period_s, 1.03, f"period {1e3 * period_s:.0f} ms", color=GREY, va="bottom", ha="right")
     for axes, words in ((left, "Time over the fastest solver's"), (right, "Time of a program (µs)")):
         axes.set_xscale("log")
         axes.set_xlabel(words)
@@ -78,7 +75,7 @@ def solvers_figure(
     left.set_ylabel("Programs solved correctly")
     left.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     right.tick_params(labelleft=False)
-    page.legend(handles, BOTTOM_IN + TALL_IN + 0.16 * rows + 0.16, columns=min(4, len(times)))
+    page.legend(handles, BOTTOM_IN + TALL_IN + 0.16 * rows + 0.28, columns=min(4, len(times)))
     return page.figure
 
 
