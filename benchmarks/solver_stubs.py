@@ -237,7 +237,8 @@ class Checked:
             sound &= np.isfinite(values).all(-1)
         sound &= np.isfinite(plan.states).all((2, 3)) & np.isfinite(command.yaw)
         # A late answer may be right and yet not be flown; a standing plan may look like one of zeros.
-        same = ~command.holding if answer is not None else np.zeros_like(sound)
+        # A UAV that guidance holds flies an answer too.
+        same = np.zeros_like(sound) if answer is None or command.planned is None else command.planned.copy()
         if answer is not None:
             same &= (plan.inputs == answer.inputs).all((2, 3))
         self.steps += int(nav.airborne.sum())
