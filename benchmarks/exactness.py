@@ -3,10 +3,10 @@
 Run ``python benchmarks/exactness.py --programs 1000000``. Programs are those of random_programs.py: rows on
 position, velocity, attitude and inputs, soft ones with prices over decades, many that contradict each other.
 Every answer is certified from the program's plain matrices: each KKT residual over one or its largest term.
-The first ``--compared`` of every stage grid are solved by PIQP at 1e-12 as well, and
-the first ``--plain`` by the method written down in plain NumPy: first inputs are compared as parts of their
-range, and objectives relative to one or their own size. An answer of PIQP whose own certificate is worse than
-1e-9 compares nothing; it is counted apart.
+The first ``--compared`` of every stage grid are solved by PIQP at 1e-12 as well, and the first ``--plain`` by
+the method written down in plain NumPy: first inputs are compared as parts of their range, and objectives
+relative to one or their own size. An answer of PIQP whose own certificate is worse than 1e-9 compares
+nothing; it is counted apart.
 
 The exit code is 1 if any program failed or was less exact than the limits printed.
 """
@@ -87,6 +87,8 @@ def compare(horizon: HorizonQp, mine: BatchResult, other: BatchSolver, count: in
     theirs = other.solve_batch(horizon)
     residual = certified(horizon, theirs)
     for run, uav in list(np.ndindex(*mine.status.shape))[:count]:
+        if mine.status[run, uav] != SOLVED:
+            continue  # counted as failed
         if theirs.status[run, uav] != SOLVED or not residual[run, uav] <= RESIDUAL:
             found.unusable += 1
             continue
@@ -108,14 +110,16 @@ def examine(grid: str, programs: int, compared: int, plain: int, seed: int) -> F
         found.cpu_s += time.thread_time() - began
         solved = result.status == SOLVED
         residual = certified(horizon, result)[solved]
-        left = found.programs
+        done = found.programs
         found.programs += solved.size
         found.failed += int((~solved).sum())
         found.short += int((~(residual <= RESIDUAL)).sum())
         found.worst = max(found.worst, float(residual.max(initial=0.0)))
-        if piqp is not None and left < compared:
-            compare(horizon, result, piqp, compared - left, found.piqp)
-        for run, uav in list(np.ndindex(*solved.shape))[: max(0, plain - left)]:
+        if piqp is not None and done < compared:
+            compare(horizon, result, piqp, compared - done, found.piqp)
+        for run, uav in list(np.ndindex(*solved.shape))[: max(0, plain - done)]:
+            if not solved[run, uav]:
+                continue
             status, inputs = PlainActiveSet(horizon, run, uav).solve()
             if status is QpStatus.SOLVED:
                 found.plain.add(result.inputs[run, uav, 0], inputs[:4])

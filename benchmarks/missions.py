@@ -8,23 +8,14 @@ from __future__ import annotations
 import argparse
 import cProfile
 import io
-import platform
 import pstats
 import statistics
 import time
-from pathlib import Path
 
 from napf_mpc.campaign import fly_block, versions
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
-
-
-def processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "unknown")
+from napf_mpc.provenance import processor
 
 
 def seconds(problem: Problem, planner: str, runs: range) -> float:

@@ -14,13 +14,13 @@ import time
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from napf_mpc.problem import Vehicle
+from napf_mpc.provenance import processor
 from napf_mpc.vehicle.plant import advance
 from napf_mpc.vehicle.quadrotor import ATTITUDE, POSITION, RATES, VELOCITY, derivative_function, hover_input
 from napf_mpc.vehicle.quadrotor import parameters as vehicle_parameters
@@ -79,14 +79,7 @@ def seconds(call: Callable[[], object], repeats: int) -> Array:
 
 def machine() -> str:
     """One line about where this runs."""
-    cpu = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [
-            line.partition(":")[2].strip() for line in info.read_text().splitlines() if "model name" in line
-        ]
-        cpu = names[0] if names else cpu
-    return f"{cpu}, {os.cpu_count()} CPUs, {platform.system()} {platform.release()}"
+    return f"{processor()}, {os.cpu_count()} CPUs, {platform.system()} {platform.release()}"
 
 
 def main() -> int:

@@ -22,7 +22,6 @@ from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
-from missions import processor
 from numpy.typing import NDArray
 
 from napf_mpc.campaign import versions
@@ -33,6 +32,7 @@ from napf_mpc.planners.mpc import QpPlanner
 from napf_mpc.planners.planner import Command
 from napf_mpc.planners.tally import FALL_BACKS, Tally
 from napf_mpc.problem_file import load_problem
+from napf_mpc.provenance import processor
 from napf_mpc.qp import Array, HorizonQp, Layout, QpStatus, Sparsity, Values
 from napf_mpc.solvers.acceptance import INPUT_TOLERANCE_N
 from napf_mpc.solvers.batch import (

@@ -30,7 +30,6 @@ import time
 from dataclasses import dataclass, field
 
 import numpy as np
-from missions import processor
 from numpy.typing import NDArray
 from scipy import stats
 
@@ -54,6 +53,7 @@ from napf_mpc.problem import (
     Simulation,
     Vehicle,
 )
+from napf_mpc.provenance import processor
 from napf_mpc.qp import STATES, HorizonQp
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals

@@ -14,8 +14,8 @@ from napf_mpc import __version__
 from napf_mpc.data_folder import find_data_file
 from napf_mpc.problem import City, Problem, Recorded
 
-_SHOWING = {"__main__.py", "cli.py", "figures.py", "interrupts.py", "report.py", "plot"}
-"""Modules that only show results: editing them leaves results as they are."""
+_SHOWING = {"__main__.py", "benchmark", "cli.py", "figures.py", "interrupts.py", "report.py", "plot"}
+"""Modules that only show or time results: editing them leaves results as they are."""
 
 
 @cache
@@ -28,6 +28,16 @@ def versions() -> dict[str, str]:
         **{name: metadata.version(name) for name in packages},
         "code": _code_digest()[:16],
     }
+
+
+def processor() -> str:
+    """Model of the processor, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []  # not Linux
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return next(iter(named), "") or platform.processor() or platform.machine()
 
 
 def _code_digest() -> str:

@@ -8,7 +8,7 @@ at once. A general solver sees one :class:`~napf_mpc.quadratic_program.Quadratic
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -120,6 +120,24 @@ class HorizonQp:
         """(run, uav, N)."""
         runs, uavs, stages = self.reference.shape[:3]
         return runs, uavs, stages
+
+    def of_one(self, run: int, uav: int) -> HorizonQp:
+        """The program of one UAV alone, as a horizon of one run and one UAV with its own arrays."""
+
+        def own(values: Array) -> Array:
+            return values[run : run + 1, uav : uav + 1].copy()
+
+        def own_or_none(values: Array | None) -> Array | None:
+            return None if values is None else own(values)
+
+        rows = tuple(
+            replace(
+                block, jac=own(block.jac), lower=own_or_none(block.lower), upper=own_or_none(block.upper),
+                w1=own_or_none(block.w1), w2=own_or_none(block.w2),
+            )
+            for block in self.rows
+        )  # fmt: skip
+        return HorizonQp(self.model, own(self.initial), own(self.reference), rows)
 
     def check(self) -> None:
         """Refuse a horizon whose parts do not fit or are not finite.

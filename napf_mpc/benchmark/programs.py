@@ -9,7 +9,7 @@ import numpy as np
 from napf_mpc.closed_loop import build_scenario, closed_loop
 from napf_mpc.planners.mpc import QpPlanner
 from napf_mpc.problem import Problem
-from napf_mpc.qp import Array, HorizonQp
+from napf_mpc.qp import HorizonQp
 from napf_mpc.solvers.batch import BatchResult, Mask, WarmStart, make_batch_solver
 
 
@@ -36,21 +36,8 @@ class Step:
     def of_one(self, run: int, uav: int) -> Step:
         """The same of one UAV."""
         at = (slice(run, run + 1), slice(uav, uav + 1))
-
-        def own(values: Array | None) -> Array | None:
-            return None if values is None else np.ascontiguousarray(values[at])
-
-        full = self.horizon
-        rows = tuple(
-            replace(
-                b, jac=np.ascontiguousarray(b.jac[at]), lower=own(b.lower), upper=own(b.upper),
-                w1=own(b.w1), w2=own(b.w2),
-            )
-            for b in full.rows
-        )  # fmt: skip
-        horizon = HorizonQp(full.model, full.initial[at].copy(), full.reference[at].copy(), rows)
         warm = None if self.warm is None else WarmStart(self.warm.z[at].copy(), self.warm.y[at].copy())
-        return Step(horizon, warm, np.ones(1, dtype=bool))
+        return Step(self.horizon.of_one(run, uav), warm, np.ones(1, dtype=bool))
 
 
 class _Recorder:

@@ -23,6 +23,7 @@ from napf_mpc.benchmark.contenders import (
     Scene,
 )
 from napf_mpc.benchmark.programs import Step, flown
+from napf_mpc.errors import ProblemError
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import Array, HorizonQp, Layout, QpStatus
@@ -63,31 +64,15 @@ class Row:
     """Wall time a program."""
 
 
-def measure(
-    scenes: Mapping[str, Scene],
-    contenders: Mapping[str, Contender],
-    *,
-    missions: int = 8,
-    every: int = 20,
-    seed: int = 0,
-    tell: Callable[[str], None] = lambda words: None,
-) -> list[Row]:
-    """All contenders on the programs of all scenes.
+def installed(contenders: Mapping[str, Contender], tell: Callable[[str], None]) -> dict[str, Contender]:
+    """Contenders whose packages are there; ``tell`` is told of the others.
 
-    Parameters
-    ----------
-    scenes, contenders : mapping
-        By label, such as :data:`~.contenders.SCENES` and :data:`~.contenders.CONTENDERS`.
-    missions, every, seed : int
-        Of the flights, see :func:`~.programs.flown`.
-    tell : callable
-        Told what is done, and which contenders are not installed.
-
-    Returns
-    -------
-    list of Row
-        The first step of each scene is left out: it pays for what is done once.
+    Raises
+    ------
+    SolverError
+        If none is there, or the reference is not.
     """
+    make_batch_solver(REFERENCE, **REFERENCE_SETTINGS)
     present = {}
     for label, contender in contenders.items():
         try:
@@ -95,14 +80,44 @@ def measure(
             present[label] = contender
         except SolverError as error:
             tell(f"{label} is left out: {error}")
+    if not present:
+        raise SolverError(f"none of these is installed: {'; '.join(contenders)}")
+    return present
+
+
+def measure(
+    label: str, scene: Scene, contenders: Mapping[str, Contender], *, missions: int, every: int, seed: int
+) -> list[Row]:
+    """All contenders on the programs of a scene.
+
+    Parameters
+    ----------
+    label : str
+        Of the scene, such as in :data:`~.contenders.SCENES`.
+    scene : Scene
+        What is flown.
+    contenders : mapping
+        By label, such as :data:`~.contenders.CONTENDERS`; all installed.
+    missions, every, seed : int
+        Of the flights, see :func:`~.programs.flown`.
+
+    Returns
+    -------
+    list of Row
+        The first step is left out: it pays for what is done once.
+
+    Raises
+    ------
+    ProblemError
+        If the flights are too short to keep two steps.
+    """
+    problem = load_problem(scene.problem, {"navigation.filter": "kalman", **scene.overrides})
+    steps = flown(problem, missions=missions, every=every, seed=seed)
+    if len(steps) < 2:
+        fault = f"every = {every}: leaves {len(steps)} steps of a mission, and two are needed; take fewer"
+        raise ProblemError(f"benchmark, {label}", [fault])
     reference = make_batch_solver(REFERENCE, **REFERENCE_SETTINGS)
-    rows: list[Row] = []
-    for label, scene in scenes.items():
-        problem = load_problem(scene.problem, {"navigation.filter": "kalman", **scene.overrides})
-        steps = flown(problem, missions=missions, every=every, seed=seed)
-        tell(f"{label}: {len(steps)} steps, {sum(step.programs for step in steps)} programs")
-        rows += _of_scene(label, problem, steps, present, reference)
-    return rows
+    return list(_of_scene(label, problem, steps, contenders, reference))
 
 
 def _of_scene(
@@ -115,7 +130,6 @@ def _of_scene(
     span = np.abs(np.linalg.inv(mixer_inverse(problem.vehicle))).sum(1) * rotor_limit(problem.vehicle)
     solvers = {name: {ALONE: c.make(), TOGETHER: c.make()} for name, c in contenders.items()}
     names = list(contenders)
-    reference.reset()
     for number, step in enumerate(steps):
         runs = np.flatnonzero(step.active)
         one = step.of_one(int(runs[number % len(runs)]), number % step.horizon.shape[1])

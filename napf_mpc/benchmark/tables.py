@@ -17,6 +17,7 @@ from typing import IO
 from napf_mpc import store
 from napf_mpc.benchmark.contenders import OSQP, REFERENCE, REFERENCE_SETTINGS
 from napf_mpc.benchmark.solvers import CORRECT, Row, Summary
+from napf_mpc.provenance import processor
 from napf_mpc.report import Rows
 
 PACKAGES = (
@@ -36,17 +37,7 @@ def machine() -> str:
             continue
     system = f"{platform.system()} {platform.machine()}"
     python = f"Python {platform.python_version()}"
-    return ", ".join([_processor(), f"{os.cpu_count()} CPUs", system, python, *found])
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass  # not Linux
-    return platform.processor() or platform.machine()
+    return ", ".join([processor(), f"{os.cpu_count()} CPUs", system, python, *found])
 
 
 def tables(summaries: Sequence[Summary], flights: str, wide: bool) -> list[Rows]:

@@ -272,12 +272,13 @@ class QpPlanner:
         if guide is None:
             free = reference = way = self._slots.over(place, times, sigma)
         else:
-            free = self._slots.over(place, times, sigma, guide.on_lanes())
             way = self._slots.over(place, times, sigma, guide)
-            reference = way if guide.taut is None else self._slots.over(place, times, sigma, guide.pulled())
+            if guide.taut is None:
+                return way, way
+            free = self._slots.over(place, times, sigma, guide.on_lanes())
+            reference = self._slots.over(place, times, sigma, guide.pulled())
             along = self._frame.along_track
-            ahead = along(free[..., POSITION]) - along(place)[..., None]
-            share = share * guide.loose_at(ahead)
+            share = share * guide.loose_at(along(free[..., POSITION]) - along(place)[..., None])
         if carried is not None and len(self._lanes) > 1:
             reference = drawn_together(reference, free, carried[0], trusted, share, self._frame)
         return reference, way

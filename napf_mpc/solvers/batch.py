@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Protocol
 
@@ -259,24 +259,7 @@ def _penalties_convex(horizon: HorizonQp) -> Mask:
 def why_unusable(layout: Layout, horizon: HorizonQp, run: int, uav: int) -> str:
     """Why a program is not shown to a solver, in words."""
     with np.errstate(invalid="ignore", over="ignore"):
-        return _why(layout, layout.values(_alone(horizon, run, uav)).of(0, 0))
-
-
-def _alone(horizon: HorizonQp, run: int, uav: int) -> HorizonQp:
-    """Horizon of one UAV."""
-
-    def own(values: Array | None) -> Array | None:
-        return None if values is None else values[run : run + 1, uav : uav + 1]
-
-    rows = tuple(
-        replace(
-            b, jac=b.jac[run : run + 1, uav : uav + 1],
-            lower=own(b.lower), upper=own(b.upper), w1=own(b.w1), w2=own(b.w2),
-        )
-        for b in horizon.rows
-    )  # fmt: skip
-    initial, reference = (v[run : run + 1, uav : uav + 1] for v in (horizon.initial, horizon.reference))
-    return HorizonQp(horizon.model, initial, reference, rows)
+        return _why(layout, layout.values(horizon.of_one(run, uav)).of(0, 0))
 
 
 def _why(layout: Layout, values: Values) -> str:

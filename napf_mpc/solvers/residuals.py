@@ -9,6 +9,20 @@ import numpy as np
 from napf_mpc.jit import compiled
 from napf_mpc.quadratic_program import Array, Index, Sparsity, Values
 
+Listed = tuple[Index, Index, Index, Index, Array, Array, Array, Array, Array, Array, Array]
+
+
+def _listed(sparsity: Sparsity, values: Values, z: Array, y: Array) -> Listed:
+    """Pattern, numbers, points and multipliers of programs as one list, in the order of the loops below."""
+    n, m = sparsity.variables, sparsity.constraints
+    count = math.prod(z.shape[:-1])
+    return (
+        sparsity.p_starts, sparsity.p_rows, sparsity.a_starts, sparsity.a_rows,
+        values.p.reshape(count, len(sparsity.p_rows)), values.q.reshape(count, n),
+        values.a.reshape(count, len(sparsity.a_rows)), values.lower.reshape(count, m),
+        values.upper.reshape(count, m), z.reshape(count, n), y.reshape(count, m),
+    )  # fmt: skip
+
 
 def kkt_residuals(sparsity: Sparsity, values: Values, z: Array, y: Array) -> tuple[Array, Array, Array]:
     """Residuals as :class:`~napf_mpc.quadratic_program.Residuals` defines them, of all programs.
@@ -27,15 +41,9 @@ def kkt_residuals(sparsity: Sparsity, values: Values, z: Array, y: Array) -> tup
     primal, dual, complementarity : array, shape (run, uav)
         Largest row violation, largest entry of ``P z + q + A' y``, largest multiplier times gap.
     """
-    batch, n, m = z.shape[:-1], sparsity.variables, sparsity.constraints
-    count = math.prod(batch)
-    out = np.empty((count, 3))
-    _residuals(
-        sparsity.p_starts, sparsity.p_rows, sparsity.a_starts, sparsity.a_rows,
-        values.p.reshape(count, len(sparsity.p_rows)), values.q.reshape(count, n),
-        values.a.reshape(count, len(sparsity.a_rows)), values.lower.reshape(count, m),
-        values.upper.reshape(count, m), z.reshape(count, n), y.reshape(count, m), out,
-    )  # fmt: skip
+    batch = z.shape[:-1]
+    out = np.empty((math.prod(batch), 3))
+    _residuals(*_listed(sparsity, values, z, y), out)
     primal, dual, complementarity = out.T.reshape(3, *batch)
     return primal, dual, complementarity
 
@@ -89,15 +97,9 @@ def relative_residuals(sparsity: Sparsity, values: Values, z: Array, y: Array) -
     array, shape (run, uav)
         No unit: 1e-9 means nine digits in every sum that ought to vanish.
     """
-    batch, n, m = z.shape[:-1], sparsity.variables, sparsity.constraints
-    count = math.prod(batch)
-    out = np.empty(count)
-    _relative(
-        sparsity.p_starts, sparsity.p_rows, sparsity.a_starts, sparsity.a_rows,
-        values.p.reshape(count, len(sparsity.p_rows)), values.q.reshape(count, n),
-        values.a.reshape(count, len(sparsity.a_rows)), values.lower.reshape(count, m),
-        values.upper.reshape(count, m), z.reshape(count, n), y.reshape(count, m), out,
-    )  # fmt: skip
+    batch = z.shape[:-1]
+    out = np.empty(math.prod(batch))
+    _relative(*_listed(sparsity, values, z, y), out)
     return out.reshape(batch)
 
 

@@ -301,21 +301,6 @@ def test_a_cost_that_leaves_an_input_undetermined_is_refused() -> None:
 # --- Batches, histories, guesses --------------------------------------------------------------------------
 
 
-def cut(horizon: HorizonQp, run: int, uav: int) -> HorizonQp:
-    def own(values: Array | None) -> Array | None:
-        return None if values is None else values[run : run + 1, uav : uav + 1]
-
-    rows = tuple(
-        replace(
-            b, jac=b.jac[run : run + 1, uav : uav + 1],
-            lower=own(b.lower), upper=own(b.upper), w1=own(b.w1), w2=own(b.w2),
-        )
-        for b in horizon.rows
-    )  # fmt: skip
-    start, reference = (v[run : run + 1, uav : uav + 1] for v in (horizon.initial, horizon.reference))
-    return HorizonQp(horizon.model, start, reference, rows)
-
-
 def test_an_answer_depends_on_its_own_numbers_and_guess_alone() -> None:
     """40 programs are more than one chunk; three steps with warm starts, one with another layout between."""
     together, alone = make_batch_solver("kernel"), make_batch_solver("kernel")
@@ -327,7 +312,7 @@ def test_an_answer_depends_on_its_own_numbers_and_guess_alone() -> None:
         for run, uav in ((0, 0), (4, 3), (9, 1)):
             at = (slice(run, run + 1), slice(uav, uav + 1))
             guess = None if warm is None else WarmStart(warm.z[at], warm.y[at])
-            single = alone.solve_batch(cut(horizon, run, uav), guess)
+            single = alone.solve_batch(horizon.of_one(run, uav), guess)
             np.testing.assert_array_equal(single.z[0, 0], whole.z[run, uav])
             np.testing.assert_array_equal(single.y[0, 0], whole.y[run, uav])
             assert single.iterations[0, 0] == whole.iterations[run, uav]
