@@ -15,6 +15,7 @@ from napf_mpc.benchmark import run
 from napf_mpc.benchmark.contenders import CONTENDERS, OSQP, SCENES, Contender, Scene
 from napf_mpc.benchmark.programs import flown
 from napf_mpc.benchmark.solvers import ALONE, TOGETHER, Row, installed, measure, summaries
+from napf_mpc.benchmark.tables import tables
 from napf_mpc.cli import run_command
 from napf_mpc.errors import ProblemError
 from napf_mpc.plot.solvers import solvers_figure
@@ -75,7 +76,7 @@ def test_claims_and_truth_are_two_columns(liars: list[Liar]) -> None:
     contenders = {"kernel": CONTENDERS["kernel"], OSQP: CONTENDERS[OSQP], "liar": Contender("liar")}
     rows = measured(contenders)
     steps = {row.step for row in rows}
-    assert len(rows) == 3 * 2 * len(steps) > 0
+    assert len(rows) == 3 * (2 + 1) * len(steps) > 0  # two missions alone, and all together
     found = {one.contender: one for one in summaries(rows)}
     assert list(found) == list(contenders)
     for name in ("kernel", OSQP):
@@ -94,11 +95,15 @@ def test_every_contender_sees_the_same_programs() -> None:
     rows = measured({name: CONTENDERS[name] for name in ("kernel", "kernel, cold")})
     for calls in (ALONE, TOGETHER):
         shown = [
-            [(row.step, row.programs) for row in rows if (row.contender, row.calls) == (name, calls)]
+            [
+                (row.step, row.run, row.uav, row.programs)
+                for row in rows
+                if (row.contender, row.calls) == (name, calls)
+            ]
             for name in ("kernel", "kernel, cold")
         ]
         assert shown[0] == shown[1]
-        assert {programs for _, programs in shown[0]} == ({1} if calls == ALONE else {8})
+        assert {programs for *_, programs in shown[0]} == ({1} if calls == ALONE else {8})
 
 
 @pytest.mark.parametrize(("keep", "warm"), [(True, True), (True, False), (False, True), (False, False)])
@@ -122,7 +127,7 @@ def test_who_is_not_installed_is_left_out_by_name(liars: list[Liar]) -> None:
 
 def test_summaries_are_quantiles_of_single_programs() -> None:
     def row(step: int, cpu_us: float, calls: str, name: str) -> Row:
-        return Row("s", name, calls, step, 1, 1, 1, 1e-12, 1e-9, cpu_us, 2.0 * cpu_us)
+        return Row("s", name, calls, step, 0, 0, 1, 1, 1, 1e-12, 1e-9, cpu_us, 2.0 * cpu_us)
 
     rows = [row(i, 10.0 + i, calls, "mine") for i in range(101) for calls in (ALONE, TOGETHER)]
     rows += [row(i, 20.0 + 2.0 * i, calls, OSQP) for i in range(101) for calls in (ALONE, TOGETHER)]
@@ -130,14 +135,20 @@ def test_summaries_are_quantiles_of_single_programs() -> None:
     assert (mine.median_us, mine.p95_us, mine.p99_us, mine.max_us) == pytest.approx((60, 105, 109, 110))
     assert mine.alone_gain == pytest.approx((2.0, 2.0, 2.0))
     assert mine.programs == 202
+    assert mine.calls == 101
+    (table,) = tables([mine], "", wide=True)
+    cells = dict(zip(table.header, table.rows[0], strict=True))
+    assert (cells["p99"], cells["max"]) == ("109", "110")
+    (table,) = tables([replace(mine, calls=99)], "", wide=True)
+    assert dict(zip(table.header, table.rows[0], strict=True))["p99"] == "-"
 
 
 def test_the_interval_of_a_gain_is_that_of_the_median() -> None:
     rows = []
     for i in range(100):
         for calls in (ALONE, TOGETHER):
-            rows.append(Row("s", "mine", calls, i, 1, 1, 1, 0.0, 0.0, 1.0, 1.0))
-            rows.append(Row("s", OSQP, calls, i, 1, 1, 1, 0.0, 0.0, float(i + 1), 1.0))
+            rows.append(Row("s", "mine", calls, i, 0, 0, 1, 1, 1, 0.0, 0.0, 1.0, 1.0))
+            rows.append(Row("s", OSQP, calls, i, 0, 0, 1, 1, 1, 0.0, 0.0, float(i + 1), 1.0))
     mine = summaries(rows)[0]
     # Order statistics 40 and 61 of 100 hold the median with 95 % at least (binomial).
     assert mine.alone_gain == (50.5, 40.0, 61.0)
@@ -149,7 +160,7 @@ def test_scenes_are_what_their_labels_say() -> None:
     for label, scene in SCENES.items():
         problem = load_problem(scene.problem, {"navigation.filter": "kalman", **scene.overrides, **SHORT})
         step = flown(problem, missions=1, every=100, seed=0)[0]
-        assert problem.world.count == count.get(label, 40)  # noqa: B009: not every world has one
+        assert problem.world.count == count.get(label, 40)
         rows[label] = (step.horizon.shape[2], sum(block.count for block in step.horizon.rows[:2]))
     assert rows["8 spheres"] == rows["40 cylinders"] == (20, 8)
     assert rows["40 spheres, N = 30"] == (30, 8)

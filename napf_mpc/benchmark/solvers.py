@@ -48,6 +48,10 @@ class Row:
     """:data:`ALONE` or :data:`TOGETHER`."""
     step: int
     """Which of the scene's."""
+    run: int
+    """Whose program; -1 for all."""
+    uav: int
+    """The same."""
     programs: int
     """In the call."""
     claimed: int
@@ -129,15 +133,16 @@ def _of_scene(
 ) -> Iterator[Row]:
     span = np.abs(np.linalg.inv(mixer_inverse(problem.vehicle))).sum(1) * rotor_limit(problem.vehicle)
     solvers = {name: {ALONE: c.make(), TOGETHER: c.make()} for name, c in contenders.items()}
-    names = list(contenders)
+    names = order = list(contenders)
     for number, step in enumerate(steps):
-        runs = np.flatnonzero(step.active)
-        one = step.of_one(int(runs[number % len(runs)]), number % step.horizon.shape[1])
-        first = number % len(names)
-        for calls, shown in ((ALONE, one), (TOGETHER, step)):
+        uavs = step.horizon.shape[1]
+        whose = [(run, (number + run) % uavs) for run in np.flatnonzero(step.active).tolist()]
+        shows = [(ALONE, at, step.of_one(*at)) for at in whose] + [(TOGETHER, (-1, -1), step)]
+        for calls, at, shown in shows:
             truth = reference.solve_batch(shown.horizon, None, shown.active)
             rows = {}
-            for name in names[first:] + names[:first]:
+            order = order[1:] + order[:1]
+            for name in order:
                 contender = contenders[name]
                 solver = solvers[name][calls]
                 if not contender.keep:
@@ -145,7 +150,7 @@ def _of_scene(
                 answer, cpu, wall = _timed(solver, shown if contender.warm else shown.cold())
                 off = _input_error(answer, truth, span)[shown.active]
                 rows[name] = Row(
-                    label, name, calls, number, shown.programs,
+                    label, name, calls, number, *at, shown.programs,
                     int((answer.status[shown.active] == SOLVED).sum()), int((off <= CORRECT).sum()),
                     float(_residual(shown.horizon, answer)[shown.active].max()), float(off.max()),
                     1e6 * cpu / shown.programs, 1e6 * wall / shown.programs,
@@ -180,11 +185,14 @@ def _residual(horizon: HorizonQp, answer: BatchResult) -> Array:
 
 @dataclass(frozen=True)
 class Summary:
-    """One contender in one scene, program by program (alone), and its time in a batch."""
+    """One contender in one scene: calls for single programs, and its time in a batch."""
 
     scene: str
     contender: str
+    calls: int
+    """For single programs: the quantiles are of these."""
     programs: int
+    """In all calls."""
     claimed: int
     correct: int
     residual: float
@@ -218,6 +226,7 @@ def summaries(rows: Sequence[Row]) -> list[Summary]:
             Summary(
                 scene,
                 contender,
+                len(alone),
                 sum(row.programs for row in everything),
                 sum(row.claimed for row in everything),
                 sum(row.correct for row in everything),

@@ -27,6 +27,10 @@ PACKAGES = (
 """Packages whose versions decide the times."""
 
 
+CALLS_FOR_P99 = 100
+"""Of fewer calls the 99th percentile is no more than the largest."""
+
+
 def machine() -> str:
     """Processor, cores, system, Python and the versions of what was timed, in one line."""
     found = []
@@ -54,7 +58,7 @@ def tables(summaries: Sequence[Summary], flights: str, wide: bool) -> list[Rows]
     """
     notes = (
         flights,
-        "Thread-CPU microseconds of a call for one program; together: for all of a step, per program.",
+        "Thread-CPU microseconds of calls for one program; together: for all of a step, per program.",
         f"Gain: time of '{OSQP}' over this one's, step by step, median [95 %]: alone, together.",
         f"Correct: first input within {CORRECT:g} of its range of {REFERENCE} at "
         f"{REFERENCE_SETTINGS['eps_abs']:g}, whatever the solver claims. Errors are the largest.",
@@ -73,6 +77,7 @@ def _cells(one: Summary, wide: bool) -> dict[str, str]:
     """Column -> cell."""
     cells = {
         "solver": one.contender,
+        "calls": str(one.calls),
         "programs": str(one.programs),
         "claimed": f"{one.claimed / one.programs:.1%}",
         "correct": f"{one.correct / one.programs:.1%}",
@@ -82,7 +87,7 @@ def _cells(one: Summary, wide: bool) -> dict[str, str]:
     }
     if wide:
         cells["p95"] = f"{one.p95_us:.0f}"
-    cells["p99"] = f"{one.p99_us:.0f}"
+    cells["p99"] = f"{one.p99_us:.0f}" if one.calls >= CALLS_FOR_P99 else "-"
     if wide:
         cells["max"] = f"{one.max_us:.0f}"
     cells["together"] = f"{one.together_us:.0f}"
