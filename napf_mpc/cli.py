@@ -6,8 +6,9 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -250,28 +251,90 @@ def figures(
         _say(str(path), quiet)
 
 
-@app.command()
-def benchmark(
-    what: Annotated[Literal["solvers"], typer.Argument(help="What to measure on this machine.")],
+benchmark = typer.Typer(
+    add_completion=False,
+    invoke_without_command=True,
+    rich_markup_mode=None,
+)
+app.add_typer(benchmark, name="benchmark")
+
+
+@benchmark.callback()
+def of_what(context: typer.Context) -> None:
+    """Measure solvers, planners and growth on this machine."""
+    if context.invoked_subcommand is None:
+        raise ProblemError("benchmark", ["of what? choose from solvers, planners, scaling"])
+
+
+Scenes = Annotated[str | None, typer.Option(help="Scenes, with semicolons (default: all).")]
+Missions = Annotated[int, typer.Option(min=1, max=1000, help="Missions flown in each scene.")]
+
+
+@benchmark.command("solvers")
+def benchmark_solvers(
     out: Out = None,
-    scenes: Annotated[str | None, typer.Option(help="Scenes, with semicolons (default: all).")] = None,
+    scenes: Scenes = None,
     contenders: Annotated[
         str | None, typer.Option("--solvers", help="Solvers, with semicolons (default: all).")
     ] = None,
-    missions: Annotated[int, typer.Option(min=1, max=1000, help="Missions flown in each scene.")] = 8,
+    missions: Missions = 8,
     every: Annotated[int, typer.Option(min=1, help="Steps of a mission from one timed to the next.")] = 20,
     seed: Seed = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Time solvers on the programs of closed-loop missions, and check what they claim."""
+    """Time solvers on programs of missions, and check their claims."""
+    from napf_mpc.benchmark import run
     from napf_mpc.benchmark.contenders import CONTENDERS, SCENES
-    from napf_mpc.benchmark.run import benchmark_solvers
 
     chosen_scenes, chosen = _chosen("scenes", scenes, SCENES), _chosen("solvers", contenders, CONTENDERS)
-    shown, paths = benchmark_solvers(
-        chosen_scenes, chosen, missions, every, seed, out, lambda words: _say(words, quiet)
-    )  # fmt: skip
-    for table in shown:
+    say = partial(_say, quiet=quiet)
+    _measured(run.benchmark_solvers(chosen_scenes, chosen, missions, every, seed, out, say), quiet)
+
+
+@benchmark.command("planners")
+def benchmark_planners(
+    out: Out = None,
+    scenes: Scenes = None,
+    pilots: Annotated[
+        str | None, typer.Option("--planners", help="Planners, with semicolons (default: all).")
+    ] = None,
+    missions: Missions = 16,
+    seed: Seed = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Time control steps and missions of planners."""
+    from napf_mpc.benchmark import run
+    from napf_mpc.benchmark.contenders import SCENES
+    from napf_mpc.benchmark.planners import PILOTS
+
+    chosen_scenes, chosen = _chosen("scenes", scenes, SCENES), _chosen("planners", pilots, PILOTS)
+    say = partial(_say, quiet=quiet)
+    _measured(run.benchmark_planners(chosen_scenes, chosen, missions, seed, out, say), quiet)
+
+
+@benchmark.command("scaling")
+def benchmark_scaling(
+    out: Out = None,
+    studies: Annotated[str | None, typer.Option(help="Studies, with semicolons (default: all).")] = None,
+    budget: Annotated[
+        float,
+        typer.Option(min=0.1, max=1e6, help="Seconds for a size; what would take longer is left out."),
+    ] = 60.0,
+    seed: Seed = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Time how the cost grows with UAVs, obstacles, ..."""
+    from napf_mpc.benchmark import run
+    from napf_mpc.benchmark.scaling import STUDIES
+
+    chosen, say = _chosen("studies", studies, STUDIES), partial(_say, quiet=quiet)
+    _measured(run.benchmark_scaling(chosen, seed, budget, out, say), quiet)
+
+
+def _measured(found: tuple[list[Rows], list[Path]], quiet: bool) -> None:
+    """Show tables and what was written."""
+    tables, paths = found
+    for table in tables:
         _show(table, quiet)
     for path in paths:
         _say(str(path), quiet)

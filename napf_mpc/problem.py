@@ -677,8 +677,10 @@ class Planner(_Section):
     """QP planner: weight of the torques [1/(N^2 m^2 s)]."""
     contact_price: float = Field(300.0, ge=0.0, le=1e9)
     """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]."""
-    contact_extra_m: float = Field(0.6, ge=0.0, le=1e3)
-    """QP planner: distance kept from obstacles on top of the margin."""
+    contact_extra_m: float = Field(0.75, ge=0.0, le=1e3)
+    """QP planner: most distance kept from obstacles on top of the margin."""
+    contact_extra_sigmas: float = Field(0.95, ge=0.0, le=1e3)
+    """QP planner: that distance in sigmas, as far as ``contact_extra_m`` goes."""
     altitude_m: tuple[Coordinate, Coordinate] | None = None
     """QP planner: least and largest height to fly at; none by default."""
     influence_scale: float = Field(0.01, ge=1e-9, le=1e6)
@@ -693,8 +695,8 @@ class Planner(_Section):
     """With ``risk_per_mission``: time for which each UAV has an obstacle at its margin, in all."""
     risk_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
     """With ``risk_per_mission``: correlation time of the position's error; by default navigation's own."""
-    covariance: Literal["held", "expected", "propagated"] = "held"
-    """QP planner: over the horizon, the covariance reported now; what the filter expects if fixes go on as now; or if none comes any more. Never less than now."""  # noqa: E501
+    covariance: Literal["held", "expected", "propagated"] = "expected"
+    """QP planner and guidance: over the horizon, the covariance reported now; what the filter expects if fixes go on as now; or if none comes any more."""  # noqa: E501
     inflation: Literal["shift", "range"] = "shift"
     """k sigma shifts the distance to the obstacle, or only widens the range of influence."""
     sigma: Literal["directional", "largest", "rms", "chi2"] = "directional"

@@ -1,4 +1,4 @@
-"""What the solver benchmark writes: every row as CSV, a table a scene, where it was measured."""
+"""What benchmarks write: every row as CSV, tables, and where they were measured."""
 
 from __future__ import annotations
 
@@ -7,18 +7,23 @@ import io
 import math
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING, Any
 
 from napf_mpc import store
 from napf_mpc.benchmark.contenders import OSQP, REFERENCE, REFERENCE_SETTINGS
-from napf_mpc.benchmark.solvers import CORRECT, Row, Summary
+from napf_mpc.benchmark.growth import Point, Study, growth
+from napf_mpc.benchmark.planners import PlannerRow
+from napf_mpc.benchmark.solvers import CORRECT, Summary
 from napf_mpc.provenance import processor
 from napf_mpc.report import Rows
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 PACKAGES = (
     "napf-mpc", "numpy", "scipy", "numba", "osqp", "qpsolvers", "piqp", "proxsuite", "daqp", "clarabel",
@@ -103,8 +108,83 @@ def _ratio(gain: tuple[float, float, float], wide: bool) -> str:
     return f"{median:.3g}" + (f" [{low:.3g}, {high:.3g}]" if wide else "")
 
 
-def write(out: Path, rows: Sequence[Row], shown: Sequence[Rows]) -> list[Path]:
-    """Write ``solvers.csv``, all rows, and ``solvers.md``, the tables, into a folder.
+def planner_tables(rows: Sequence[PlannerRow], flights: str) -> list[Rows]:
+    """One table a scene."""
+    notes = (
+        flights,
+        "Thread-CPU microseconds of a control step for one formation; late: wall time beyond the planner's "
+        "period.",
+        "Mission: processor milliseconds of one of those flown in lock-step, with its verdict; planning: the "
+        "planner's part of it.",
+        machine(),
+    )
+    scenes = list(dict.fromkeys(row.scene for row in rows))
+    shown = []
+    for scene in scenes:
+        cells = [
+            {
+                "planner": row.planner,
+                "steps": str(row.steps),
+                "median": f"{row.median_us:.0f}",
+                "p95": f"{row.p95_us:.0f}",
+                "p99": f"{row.p99_us:.0f}" if row.steps >= CALLS_FOR_P99 else "-",
+                "max": f"{row.max_us:.0f}",
+                "late": str(row.late),
+                "mission (ms)": f"{row.mission_ms:.1f}",
+                "missions/s": f"{1e3 / row.mission_ms:.1f}",
+                "planning": f"{row.planning:.0%}",
+            }
+            for row in rows
+            if row.scene == scene
+        ]
+        lines = tuple(tuple(line.values()) for line in cells)
+        shown.append(Rows(scene, tuple(cells[0]), lines, notes if scene == scenes[-1] else ()))
+    return shown
+
+
+def scaling_tables(
+    points: Mapping[str, Sequence[Point]], studies: Mapping[str, Study], flights: str
+) -> list[Rows]:
+    """One table a study, with its fitted exponent."""
+    shown = []
+    for label, own in points.items():
+        study, fit = studies[label], growth(own)
+        lines = tuple(
+            (
+                f"{point.size:,}", str(point.uavs), str(point.calls), f"{1e-3 * point.cost_us:.3g}",
+                f"{1e-3 * point.mean_us:.3g}",
+                f"{1e-3 * point.p99_us:.3g}" if point.calls >= CALLS_FOR_P99 else "-",
+                f"{study.share_us(point):.3g}",
+            )
+            for point in own
+        )  # fmt: skip
+        words = "too few sizes for an exponent"
+        if math.isfinite(fit.exponent):
+            words = (
+                f"Cost ~ size^{fit.exponent:.2f} [{fit.exponent - fit.half_width:.2f}, "
+                f"{fit.exponent + fit.half_width:.2f}] (95 %); over the last two sizes ^{fit.last:.2f}."
+            )
+        notes: tuple[str, ...] = (words,)
+        if label == list(points)[-1]:
+            notes = (words, flights, machine())
+        header = (study.grows, "UAVs a call", "calls", "median ms", "mean ms", "p99 ms", f"us a {study.unit}")
+        shown.append(Rows(f"{label}: {study.costs}", header, lines, notes))
+    return shown
+
+
+def write(out: Path, stem: str, rows: Sequence[DataclassInstance], shown: Sequence[Rows]) -> list[Path]:
+    """Write ``stem.csv``, all rows, and ``stem.md``, the tables, into a folder.
+
+    Parameters
+    ----------
+    out : Path
+        Folder; made if missing.
+    stem : str
+        Of the files.
+    rows : sequence of dataclass, at least one
+        All of one kind.
+    shown : sequence of Rows
+        Tables.
 
     Raises
     ------
@@ -113,10 +193,13 @@ def write(out: Path, rows: Sequence[Row], shown: Sequence[Rows]) -> list[Path]:
     """
     folder = store.output_folder(out)
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, [field.name for field in fields(Row)], lineterminator="\n")
+    writer: csv.DictWriter[str] = csv.DictWriter(
+        text, [field.name for field in fields(rows[0])], lineterminator="\n"
+    )
     writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
-    paths = [folder / "solvers.csv", folder / "solvers.md"]
+    values: list[dict[str, Any]] = [asdict(row) for row in rows]
+    writer.writerows(values)
+    paths = [folder / f"{stem}.csv", folder / f"{stem}.md"]
     words = "\n".join(table.markdown() for table in shown)
     for path, content in zip(paths, (text.getvalue(), words), strict=True):
         store.write_bytes(path, partial(_put, content.encode()))

@@ -13,7 +13,7 @@ influence, ``rho_bar >= rho_0``, whose penalty pulls like NAPF.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -54,6 +54,8 @@ class Gaps:
     """(run, uav, N, M, 3) unit gradient of the distance; zero without."""
     margin: Array
     """(run, uav, N, M) k sigma [m]."""
+    sigma: Array
+    """(run, uav, N, M) standard deviation of the position in the direction of the normal [m]."""
     shifted: Array
     """(run, uav, N, M) distance that enters the potential field, rho_bar; +inf without [m]."""
     influence: Array
@@ -90,17 +92,16 @@ class Gaps:
         )
         shape, points = (runs, uavs, stages, 2 * count), runs * uavs * stages
         normal, index = near.gradient.reshape(*shape, 3), near.index.reshape(shape)
-        if margin == "exact":
-            size = _exact(horizon, index, normal, inflation)
-        else:
-            size = _half_space(horizon.covariance, normal, inflation)
+        sigma = _sigma(horizon.covariance, normal, inflation)
+        size = _exact(horizon, index, normal, inflation) if margin == "exact" else inflation.k * sigma
         kept = (runs, uavs, stages, count)
-        gaps = cls(np.empty(kept), np.empty((*kept, 3)), np.empty(kept), np.empty(kept), np.empty(kept))
+        gaps = cls(np.empty(kept), np.empty((*kept, 3)), *[np.empty(kept) for _ in range(4)])
         _choose(
             near.distance.reshape(points, 2 * count),
             near.gradient.reshape(points, 2 * count, 3),
             near.index.reshape(points, 2 * count),
             size.reshape(points, 2 * count),
+            sigma.reshape(points, 2 * count),
             radius,
             reach_m,
             inflation.mode == "shift",
@@ -108,6 +109,7 @@ class Gaps:
             gaps.distance.reshape(points, count),
             gaps.normal.reshape(points, count, 3),
             gaps.margin.reshape(points, count),
+            gaps.sigma.reshape(points, count),
             gaps.shifted.reshape(points, count),
             gaps.influence.reshape(points, count),
         )
@@ -117,7 +119,7 @@ class Gaps:
         """Coefficients and lower bounds of rows "shifted distance >= distance" on the position."""
         return self.normal, along_rows(self.normal, position) + (distance - self.shifted)
 
-    def opening(self, horizon: Horizon, distance_m: float, speed_mps: float) -> Array:
+    def opening(self, horizon: Horizon, distance_m: Array | float, speed_mps: float) -> Array:
         """Shifted distances (run, uav, N, M) to ask for, where one that is short now opens at a speed [m].
 
         Now is the plan's first node, seen along each row's own normal.
@@ -134,6 +136,7 @@ def _choose(
     normal: Array,
     index: Index,
     size: Array,
+    sigma: Array,
     radius: float,
     reach_m: float,
     shift: bool,
@@ -141,6 +144,7 @@ def _choose(
     out_distance: Array,
     out_normal: Array,
     out_size: Array,
+    out_sigma: Array,
     out_shifted: Array,
     out_influence: Array,
 ) -> None:
@@ -148,8 +152,10 @@ def _choose(
 
     Parameters
     ----------
-    distance, normal, index, size : array, shapes (point, m), (point, m, 3), (point, m) and (point, m)
-        As the map answers, nearest first, and margins.
+    distance, normal, index : array, shapes (point, m), (point, m, 3) and (point, m)
+        As the map answers, nearest first.
+    size, sigma : array, shape (point, m)
+        Margins and standard deviations [m].
     radius, reach_m : float
         Of the UAV, and the shifted distance from which on an obstacle counts as none [m].
     shift : bool
@@ -184,7 +190,7 @@ def _choose(
             i = place[j]
             none = rank[i] == np.inf
             gap = distance[p, i] - radius
-            out_size[p, j] = size[p, i]
+            out_size[p, j], out_sigma[p, j] = size[p, i], sigma[p, i]
             out_distance[p, j] = np.inf if none else gap
             out_shifted[p, j] = np.inf if none else gap - size[p, i] if shift else gap
             out_influence[p, j] = rho_0 if shift else rho_0 + size[p, i]
@@ -192,29 +198,26 @@ def _choose(
                 out_normal[p, j, axis] = 0.0 if none else normal[p, i, axis]
 
 
-def _half_space(covariance: Array, normal: Array, inflation: Inflation) -> Array:
-    """Margins (run, uav, N, m) against flat walls."""
+def _sigma(covariance: Array, normal: Array, inflation: Inflation) -> Array:
+    """Sigmas (run, uav, N, m) as the inflation reads them: k of them are the margin of a flat wall."""
     if inflation.reading not in ("directional", "chi2"):
-        return plain(inflation.margin(covariance, normal))
+        return plain(replace(inflation, k=1.0).margin(covariance, normal))
     points, m = math.prod(normal.shape[:-2]), normal.shape[-2]
-    size = np.empty(normal.shape[:-1])
+    sigma = np.empty(normal.shape[:-1])
     _directional(
-        plain(covariance).reshape(points, 3, 3),
-        normal.reshape(points, m, 3),
-        inflation.k,
-        size.reshape(points, m),
+        plain(covariance).reshape(points, 3, 3), normal.reshape(points, m, 3), sigma.reshape(points, m)
     )
-    return size
+    return sigma
 
 
 @compiled
-def _directional(covariance: Array, normal: Array, k: float, size: Array) -> None:
-    """Write k sigma along normals: covariance (point, 3, 3), normal (point, m, 3), size (point, m)."""
+def _directional(covariance: Array, normal: Array, sigma: Array) -> None:
+    """Write sigma along normals: covariance (point, 3, 3), normal (point, m, 3), sigma (point, m)."""
     for p in range(normal.shape[0]):
         for j in range(normal.shape[1]):
             x, y, z = normal[p, j, 0], normal[p, j, 1], normal[p, j, 2]
             none = x == 0.0 and y == 0.0 and z == 0.0
-            size[p, j] = 0.0 if none else k * sigma_along(covariance[p], x, y, z)
+            sigma[p, j] = 0.0 if none else sigma_along(covariance[p], x, y, z)
 
 
 def _exact(horizon: Horizon, index: Index, normal: Array, inflation: Inflation) -> Array:
@@ -296,7 +299,10 @@ class ObstacleContact(_Shell):
     """
 
     extra_m: float = 0.0
-    """Distance kept on top of the margin [m]."""
+    """Distance kept on top of the margin [m], ..."""
+    extra_sigmas: float | None = None
+    """... or this many sigmas, if that is less: what an error drifts by while the UAV answers is in
+    proportion to it. None keeps ``extra_m`` whatever sigma is."""
     opening_mps: float | None = None
     """A UAV that is inside a margin now is asked to leave it at this speed, not at once: a sigma that jumps
     by tens of metres must not make it lunge. None asks at once [m/s]."""
@@ -307,6 +313,8 @@ class ObstacleContact(_Shell):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.extra_sigmas is not None and not self.extra_sigmas >= 0.0:
+            raise ConstraintError(f"extra_sigmas = {self.extra_sigmas!r}, must be >= 0, or None")
         if self.opening_mps is not None and not self.opening_mps > 0.0:
             raise ConstraintError(f"opening_mps = {self.opening_mps!r}, must be > 0, or None")
 
@@ -319,14 +327,20 @@ class ObstacleContact(_Shell):
         """Most that plans (run, uav, N, 3) are inside the margin of an obstacle of their rows [m]."""
         gaps = self.gaps(horizon, self.extra_m)
         moved = along_rows(gaps.normal, position) - along_rows(gaps.normal, horizon.position)
-        return np.asarray(np.maximum(self.extra_m - (gaps.shifted + moved), 0.0).max(axis=(2, 3)))
+        return np.asarray(np.maximum(self._extra(gaps) - (gaps.shifted + moved), 0.0).max(axis=(2, 3)))
+
+    def _extra(self, gaps: Gaps) -> Array | float:
+        """Distance on top of the margin, one number or (run, uav, N, M) [m]."""
+        if self.extra_sigmas is None:
+            return self.extra_m
+        return np.minimum(self.extra_m, self.extra_sigmas * gaps.sigma)
 
     def rows(self, horizon: Horizon) -> LinearRows:
         """Rows ``n^T p >= n^T p_lin - rho_bar(p_lin) + extra - s`` [m]."""
         gaps = self.gaps(horizon, self.extra_m)
-        asked: Array | float = self.extra_m
+        asked = self._extra(gaps)
         if self.opening_mps is not None:
-            asked = gaps.opening(horizon, self.extra_m, self.opening_mps)
+            asked = gaps.opening(horizon, asked, self.opening_mps)
         jac, lower = gaps.rows_beyond(horizon.position, asked)
         slack = (*horizon.shape, 1)
         return LinearRows(

@@ -117,13 +117,15 @@ class CovarianceForecast:
         )
         return out
 
-    def growth(self, ahead_s: Array, with_fixes: bool) -> Array:
-        """By how much the variance (run, uav, N, 3) will exceed that of now, never negative [m^2].
+    def change(self, ahead_s: Array, with_fixes: bool) -> Array:
+        """Factor (run, uav, N, 3) from the variance now to that of then; 1 where now it is none.
 
         Parameters are those of :meth:`variance`.
         """
         now = self.packed[..., None, :, 0]
-        return np.maximum(self.variance(ahead_s, with_fixes) - now, 0.0)
+        # A negative difference of rounding must not become a factor.
+        then = np.maximum(self.variance(ahead_s, with_fixes), 0.0)
+        return np.where(now == 0.0, 1.0, then / np.where(now == 0.0, 1.0, now))
 
 
 @compiled

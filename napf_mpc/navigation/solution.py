@@ -66,10 +66,9 @@ class NavSolution:
         return np.asarray(sigma[:, i] + sigma[:, j] - cross - cross.transpose(0, 2, 1))
 
     def position_covariance_ahead(self, ahead_s: Array, with_fixes: bool) -> Array:
-        """Covariance of the position at times from now: that of now, grown as the filter expects.
+        """Covariance of the position at times from now: that of now, each axis with the variance of then.
 
-        Never less than now in any direction: the growth of each axis counts where it is positive. Covariance
-        between axes is held. Without a forecast all is.
+        Correlations between axes are held. Without a forecast all is.
 
         Parameters
         ----------
@@ -85,7 +84,8 @@ class NavSolution:
         """
         out = np.repeat(self.position_covariance[:, :, None], len(ahead_s), axis=2)
         if self.forecast is not None:
-            np.einsum("...ii->...i", out)[...] += self.forecast.growth(ahead_s, with_fixes)
+            scale = np.sqrt(self.forecast.change(ahead_s, with_fixes))
+            out *= scale[..., :, None] * scale[..., None, :]
         return out
 
     def trusted(self) -> NDArray[np.bool_]:

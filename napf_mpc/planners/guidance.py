@@ -53,7 +53,7 @@ class Guidance:
         self._frame = frame_of(self._path)
         self._slots = formation_offsets(problem.formation)
         self._lanes = np.ascontiguousarray(self._slots[:, 1:])
-        self._extra_m = problem.planner.contact_extra_m
+        self._extra = problem.planner.contact_extra_m, problem.planner.contact_extra_sigmas
         self._min_separation = problem.vehicle.min_separation_m
         self._traffic = TrafficPace(
             self._path, problem.mission.speed_mps, problem.vehicle.radius_m, inflation
@@ -177,7 +177,7 @@ class Guidance:
         if taut:
             pulled, loose = pulled_taut(
                 self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
-                self._inflation.k, self._search.radius_m + self._extra_m, self.settings.taut_slope,
+                self._inflation.k, self._search.radius_m, self._extra, self.settings.taut_slope,
             )  # fmt: skip
             self._taut = np.concatenate([pulled, loose[..., None]], axis=-1)
         self._hold(offset, elapsed_s)

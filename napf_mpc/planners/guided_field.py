@@ -60,7 +60,11 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
         position, covariance, trusted = self._estimates(nav)
-        guide = self.guidance.step(position, covariance, trusted, time_s, nav.tracks)
+        room = covariance
+        if settings.covariance == "expected":
+            ahead = nav.position_covariance_ahead(np.array([settings.look_ahead_s]), with_fixes=True)
+            room = np.where(trusted[..., None, None], ahead[:, :, 0], covariance)
+        guide = self.guidance.step(position, room, trusted, time_s, nav.tracks)
         self.guide = guide
         place = self._frame.to_path(position)
         error = synchronisation_error(place[..., 0], self._offsets[:, 0])

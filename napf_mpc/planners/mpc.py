@@ -65,7 +65,11 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     settings = problem.planner
     rows, price = settings.obstacle_rows, settings.contact_price
     contact = ObstacleContact(
-        obstacles=rows, w1=price, extra_m=settings.contact_extra_m, opening_mps=LEAVING_MPS
+        obstacles=rows,
+        w1=price,
+        extra_m=settings.contact_extra_m,
+        extra_sigmas=settings.contact_extra_sigmas,
+        opening_mps=LEAVING_MPS,
     )
     most = REPULSION_PART * price if price > 0.0 else math.inf
     influence = ObstacleInfluence(obstacles=rows, per_speed=settings.influence_scale, most=most)
@@ -178,9 +182,11 @@ class QpPlanner:
         trusted = nav.trusted()
         state = self._state(nav, trusted)
         carried = self._carried(state, time_s)
-        reference, way = self._references(state, carried, nav, trusted, None)
+        covariance = self._covariance(nav, trusted)
+        reference, way = self._references(state, carried, nav, covariance, trusted, None)
         guess, _ = self._guess(state, way, carried, time_s)
-        return self._programs(state, reference, self._horizon(guess, nav, trusted, time_s))
+        horizon = self._horizon(guess, covariance, nav, trusted, time_s)
+        return self._programs(state, reference, horizon)
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
         """Solve this step's programs and command what was accepted, or what the ladder says."""
@@ -189,15 +195,19 @@ class QpPlanner:
         self._tracks = nav.tracks
         self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
         state = self._state(nav, trusted)
-        covariance = np.where(trusted[..., None, None], nav.position_covariance, np.eye(3))
+        covariance = self._covariance(nav, trusted)
         guide = None
         if self._guidance is not None:
-            # Raw measurements jump by more than what a taut way could gain.
-            guide = self._guidance.step(state[..., POSITION], covariance, trusted, time_s, taut=nav.filtered)
+            # What lies beyond the horizon is passed when navigation is as certain as it will be at its end,
+            # but not as lost as without fixes. Raw measurements jump by more than a taut way could gain.
+            stage = 0 if self.problem.planner.covariance == "propagated" else -1
+            room = covariance[:, :, stage]
+            guide = self._guidance.step(state[..., POSITION], room, trusted, time_s, taut=nav.filtered)
         carried = self._carried(state, time_s)
-        reference, way = self._references(state, carried, nav, trusted, guide)
+        reference, way = self._references(state, carried, nav, covariance, trusted, guide)
         began = 0.0 if self._clock is None else self._clock()
-        answer = self._solve(state, reference, self._guess(state, way, carried, time_s), nav, trusted, time_s)
+        guess = self._guess(state, way, carried, time_s)
+        answer = self._solve(state, reference, guess, covariance, nav, trusted, time_s)
         late = self._clock is not None and not self._clock() - began <= self._period_s
         refused = refusals(answer, self._limits)
         upset = np.abs(state[..., 6:10:2]).max(-1) > UPSET_RAD
@@ -232,12 +242,16 @@ class QpPlanner:
             solver_status=_WORDS[answer.status],
         )
 
-    def _sigma(self, nav: NavSolution, trusted: Mask) -> Array:
-        """Sigmas (run, uav, 3) of position measurements along, left and up; 0 of estimates [m]."""
-        if nav.filtered:
-            return np.zeros((*trusted.shape, 3))
-        covariance = np.where(trusted[..., None, None], nav.position_covariance, 0.0)
-        axes = [directional_sigma(covariance, axis) for axis in self._frame.axes]
+    def _doubt(self, nav: NavSolution, trusted: Mask, covariance: Array) -> Array:
+        """Sigmas (run, uav, 3) along, left and up of what will prove to have been error [m].
+
+        Of a measurement all of its error; of an estimate what the filter will have corrected at the end of
+        the horizon, by its own covariance (run, uav, N, 3, 3). The rest of an estimate's error does not
+        depend on the estimate.
+        """
+        passing = nav.position_covariance - covariance[:, :, -1] if nav.filtered else nav.position_covariance
+        passing = np.where(trusted[..., None, None], passing, 0.0)
+        axes = [directional_sigma(passing, axis) for axis in self._frame.axes]
         return np.stack(axes, axis=-1)
 
     def _state(self, nav: NavSolution, trusted: Mask) -> Array:
@@ -263,11 +277,13 @@ class QpPlanner:
         state: Array,
         carried: tuple[Array, Array] | None,
         nav: NavSolution,
+        covariance: Array,
         trusted: Mask,
         guide: Guide | None,
     ) -> tuple[Array, Array]:
         """States (run, uav, N, 12) to track, and of the way that guidance has found."""
-        place, times, sigma = state[..., POSITION], self._model.times_s, self._sigma(nav, trusted)
+        place, times = state[..., POSITION], self._model.times_s
+        sigma = self._doubt(nav, trusted, covariance)
         share: Array | float = self.problem.planner.cohesion
         if guide is None:
             free = reference = way = self._slots.over(place, times, sigma)
@@ -302,14 +318,16 @@ class QpPlanner:
             states = np.where(stuck[..., None, None], way, states)
         return states, inputs
 
-    def _horizon(self, guess: Array, nav: NavSolution, trusted: Mask, time_s: float) -> Horizon:
+    def _horizon(
+        self, guess: Array, covariance: Array, nav: NavSolution, trusted: Mask, time_s: float
+    ) -> Horizon:
         known = trusted[..., None, None]
         return Horizon(
             time_s=time_s,
             step_s=self._model.step_s,
             position=cut_at_obstacles(guess[..., POSITION], self._obstacles),
             velocity=np.ascontiguousarray(guess[..., VELOCITY]),
-            covariance=np.where(known[..., None], self._covariance(nav), np.eye(3)),
+            covariance=covariance,
             common_factor=np.where(known, nav.common_factor, 0.0),
             obstacles=self._obstacles,
             frame=self._frame,
@@ -317,12 +335,14 @@ class QpPlanner:
             tracks=nav.tracks,
         )
 
-    def _covariance(self, nav: NavSolution) -> Array:
+    def _covariance(self, nav: NavSolution, trusted: Mask) -> Array:
         """Covariance of the position (run, uav, N, 3, 3) at the end of each stage, as the problem asks."""
         asked = self.problem.planner.covariance
         if asked == "held":
-            return np.repeat(nav.position_covariance[:, :, None], self._model.stages, axis=2)
-        return nav.position_covariance_ahead(self._model.times_s, with_fixes=asked == "expected")
+            covariance = np.repeat(nav.position_covariance[:, :, None], self._model.stages, axis=2)
+        else:
+            covariance = nav.position_covariance_ahead(self._model.times_s, with_fixes=asked == "expected")
+        return np.where(trusted[..., None, None, None], covariance, np.eye(3))
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
@@ -338,6 +358,7 @@ class QpPlanner:
         state: Array,
         reference: Array,
         guess: tuple[Array, Array],
+        covariance: Array,
         nav: NavSolution,
         trusted: Mask,
         time_s: float,
@@ -351,7 +372,7 @@ class QpPlanner:
                 better = np.asarray(np.isfinite(answer.states).all(axis=(2, 3), keepdims=True))
                 states = np.where(better, _moved(answer.states, origin), states)
                 inputs = np.where(better, answer.inputs, inputs)
-            self._last_horizon = self._horizon(states, nav, trusted, time_s)
+            self._last_horizon = self._horizon(states, covariance, nav, trusted, time_s)
             programs = self._programs(state, reference, self._last_horizon)
             warm = None if answer is None else answer.warm_start(_moved(states, -origin), inputs)
             answer = self._answer_to(programs, warm, asked)

@@ -43,6 +43,7 @@ def pulled_taut(
     covariance: Array,
     k: float,
     radius_m: float,
+    extra: tuple[float, float],
     slope: float,
 ) -> tuple[Array, Array]:
     """Offsets as near to the lanes as the margins allow, and how loose they are.
@@ -67,6 +68,8 @@ def pulled_taut(
         Sigmas.
     radius_m : float
         Of a UAV [m].
+    extra : (float, float)
+        Distance on top of the margin: at most so many metres, and so many sigmas.
     slope : float
         At which a place leads back to the way, per metre of path.
 
@@ -81,7 +84,7 @@ def pulled_taut(
     loose = np.ones(profiles.shape[:3])
     _pull(
         obstacles.solids, obstacles.tree, obstacles.scene_start, along, step_m, lanes, frame, covariance, k,
-        radius_m, slope * step_m, out, loose,
+        radius_m, extra, slope * step_m, out, loose,
     )  # fmt: skip
     return out, loose
 
@@ -98,13 +101,15 @@ def _short(
     covariance: Array,
     k: float,
     radius_m: float,
+    extra: tuple[float, float],
     nodes: NDArray[np.int64],
     bounds: Array,
 ) -> bool:
     """Whether a place in path coordinates lacks the margin."""
     px, py, pz = world_place(frame, along, left, up)
     d, gx, gy, gz, _ = nearest_obstacle(solids, tree, scene, px, py, pz, nodes, bounds)
-    return bool(radius_m + k * sigma_along(covariance, gx, gy, gz) > d)
+    sigma = sigma_along(covariance, gx, gy, gz)
+    return bool(radius_m + k * sigma + min(extra[0], extra[1] * sigma) > d)
 
 
 @compiled
@@ -119,6 +124,7 @@ def _pull(
     covariance: Array,
     k: float,
     radius_m: float,
+    extra: tuple[float, float],
     most: float,
     out: Array,
     loose: Array,
@@ -156,7 +162,7 @@ def _pull(
                     kept = 1.0 - want / size
                     if _short(
                         solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
-                        nodes, bounds,
+                        extra, nodes, bounds,
                     ):  # fmt: skip
                         blocked = want
                     else:

@@ -1,4 +1,4 @@
-"""Solvers on the same programs: how often within a factor of the fastest, and how often within a time."""
+"""How often a solver or a planner is within a factor of the fastest, and how often within a time."""
 
 from __future__ import annotations
 
@@ -65,8 +65,7 @@ def solvers_figure(
         _steps(left, values[solvable] / best[solvable], colour, dash)
         _steps(right, values, colour, dash)
         handles.append(Line2D([], [], label=name, color=colour, linestyle=dash))
-    right.axvline(1e6 * period_s, color=GREY, linewidth=0.8)
-    right.text(1e6 * period_s, 1.03, f"period {1e3 * period_s:.0f} ms", color=GREY, va="bottom", ha="right")
+    _period(right, period_s)
     for axes, words in ((left, "Time over the fastest solver's"), (right, "Time of a program (µs)")):
         axes.set_xscale("log")
         axes.set_xlabel(words)
@@ -90,6 +89,51 @@ def draw_solvers(
     """Write :func:`solvers_figure` as PNG and SVG into a folder."""
     with house_style():
         return save(solvers_figure(times, correct, period_s, note), out, stem)
+
+
+def step_times_figure(times: Mapping[str, Array], period_s: float, note: str = "") -> Figure:
+    """Distribution of the times of control steps.
+
+    Parameters
+    ----------
+    times : mapping of array, shape (steps,)
+        Label of a planner -> thread-CPU time of each of its steps [us].
+    period_s : float
+        Of the planner, drawn as a line [s].
+    note : str
+        Printed below.
+    """
+    width = 4.6
+    rows = -(-len(times) // 3)
+    page = Page.of_size(width, BOTTOM_IN + TALL_IN + 0.16 * rows + 0.32, note)
+    axes = page.axes(LEFT_IN, BOTTOM_IN, width - LEFT_IN - RIGHT_IN, TALL_IN)
+    handles = []
+    for i, (name, values) in enumerate(times.items()):
+        colour, dash = COLOURS[i % len(COLOURS)], DASHES[i // len(COLOURS) % len(DASHES)]
+        _steps(axes, values, colour, dash)
+        handles.append(Line2D([], [], label=name, color=colour, linestyle=dash))
+    _period(axes, period_s)
+    axes.set_xscale("log")
+    axes.set_xlabel("Time of a control step of the formation (µs)")
+    axes.set_ylim(0.0, 1.02)
+    axes.set_ylabel("Steps")
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    page.legend(handles, BOTTOM_IN + TALL_IN + 0.16 * rows + 0.28, columns=min(3, len(times)))
+    return page.figure
+
+
+def draw_step_times(
+    times: Mapping[str, Array], period_s: float, out: Path, stem: str, note: str = ""
+) -> list[Path]:
+    """Write :func:`step_times_figure` as PNG and SVG into a folder."""
+    with house_style():
+        return save(step_times_figure(times, period_s, note), out, stem)
+
+
+def _period(axes: Axes, period_s: float) -> None:
+    """Line at the planner's period."""
+    axes.axvline(1e6 * period_s, color=GREY, linewidth=0.8)
+    axes.text(1e6 * period_s, 1.03, f"period {1e3 * period_s:.0f} ms", color=GREY, va="bottom", ha="right")
 
 
 def _steps(axes: Axes, values: Array, colour: str, dash: Literal["-", "--", ":"]) -> None:

@@ -1,5 +1,6 @@
 """Clearance rows: the slack is the gap in metres, and the influence shell pulls as hard as NAPF."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -94,6 +95,29 @@ def test_the_slack_is_the_shortfall_in_metres(step_s: float) -> None:
     assert rows.violation(moved).max() == pytest.approx(0.0, abs=1e-9)
     assert rows.shared_slack
     assert rows.slack_count == 1
+
+
+@pytest.mark.parametrize(
+    ("extra_sigmas", "kept"), [(None, 0.25), (0.4, 0.2), (0.5, 0.25), (2.0, 0.25), (0.0, 0.0)]
+)
+def test_the_extra_distance_is_metres_at_most_and_sigmas_up_to_there(
+    extra_sigmas: float | None, kept: float
+) -> None:
+    """Sigma is 0.5 m, and what is kept on top of the margin does not depend on k."""
+    horizon = hover_at((7.5, 0.0, 50.0), EAST_SPHERE, of=problem(radius_m=0.3))
+    for k in (0.0, 1.0, 3.0):
+        contact = ObstacleContact(Inflation(k), extra_m=0.25, extra_sigmas=extra_sigmas)
+        rows = contact.rows(horizon)
+        assert rows.violation(horizon.position).max(-1) == pytest.approx(
+            max(0.3 + 0.5 * k + kept - 0.5, 0.0), abs=1e-9
+        )
+        assert contact.shortfall(horizon, horizon.position) == pytest.approx(
+            max(0.3 + 0.5 * k + kept - 0.5, 0.0), abs=1e-9
+        )
+    with pytest.raises(ConstraintError, match="extra_sigmas = -1"):
+        ObstacleContact(extra_sigmas=-1.0)
+    with pytest.raises(ConstraintError, match="extra_sigmas = nan"):
+        ObstacleContact(extra_sigmas=math.nan)
 
 
 WORLDS: dict[str, tuple[Shape, tuple[float, float, float], float, tuple[float, float, float]]] = {
@@ -448,6 +472,7 @@ def test_walls_and_roofs_have_the_margin_of_a_wall() -> None:
         ObstacleContact(Inflation(3.0, reading="largest")),
         ObstacleContact(margin="exact"),
         ObstacleContact(extra_m=0.2, opening_mps=2.0),
+        ObstacleContact(extra_m=0.2, extra_sigmas=0.3),
         ObstacleInfluence(),
         ObstacleInfluence(most=5.0),
         ObstacleInfluence(Inflation(1.0, reading="rms"), obstacles=8),

@@ -20,11 +20,13 @@ LANE = np.array([[3.0, 0.0]])
 PATH = PathFrame.from_angles((0.0, 0.0, 0.0), 0.0, 0.0)
 
 
-def pulled(profile: Array, shapes: list[Shape], slope: float = 100.0) -> tuple[Array, Array]:
+def pulled(
+    profile: Array, shapes: list[Shape], slope: float = 100.0, extra: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Array, Array]:
     """Offsets (station, 2) and how loose they are, of one UAV that starts at 0."""
     offsets, loose = pulled_taut(
         profile[None, None], np.zeros((1, 1)), STEP, LANE, frame_of(PATH), ObstacleSet.from_shapes(shapes),
-        SIGMA**2 * np.eye(3)[None, None], K, RADIUS, slope,
+        SIGMA**2 * np.eye(3)[None, None], K, RADIUS, extra, slope,
     )  # fmt: skip
     return offsets[0, 0], loose[0, 0]
 
@@ -49,6 +51,15 @@ def test_beside_an_obstacle_it_keeps_the_margin_and_hardly_more() -> None:
     places = np.stack([STEP * np.arange(STATIONS), LANE[0, 0] + offsets[:, 0], offsets[:, 1]], axis=-1)
     assert ObstacleSet.from_shapes([ball]).signed_distance(places[None]).min() >= NEED
     np.testing.assert_array_equal(offsets[:20], 0.0)
+
+
+@pytest.mark.parametrize(("extra", "kept"), [((0.4, 10.0), 0.4), ((9.0, 0.6), 0.3)])
+def test_what_is_kept_on_top_is_in_metres_at_most_and_in_sigmas(
+    extra: tuple[float, float], kept: float
+) -> None:
+    ball = Sphere((24.0, 3.0, 0.0), 1.0)
+    offsets, _ = pulled(aside(5.0), [ball], extra=extra)
+    assert 1.0 + NEED + kept <= offsets[24, 0] <= 1.0 + NEED + kept + 0.05
 
 
 def test_it_is_not_pulled_across_what_stands_between_it_and_the_lane() -> None:
