@@ -69,12 +69,12 @@ print(
 # %%
 alone = {name: [row for row in rows if (row.contender, row.calls) == (name, ALONE)] for name in contenders}
 with house_style():
-    solvers_figure(
+    profile = solvers_figure(
         {name: np.array([row.cpu_us for row in own]) for name, own in alone.items()},
         {name: np.array([row.correct == 1 for row in own]) for name, own in alone.items()},
         1.0 / load_problem("study_40s").planner.rate_hz,
     )
-    plt.show()
+profile
 
 # %% [markdown]
 # ## 2. What a program costs the exact solver
