@@ -29,6 +29,8 @@ STEPS = 5
 """Places looked at between the guide's way and the lane."""
 SAME_M = 0.01
 """Offsets below this are none."""
+ROUNDING_M = 1e-6
+"""Bounds on distances are taken this much too wide."""
 NEAR_M = 0.05
 """How near to the margin a place comes."""
 
@@ -90,7 +92,7 @@ def pulled_taut(
 
 
 @compiled
-def _short(
+def _room(
     solids: Solids,
     tree: BoxTree,
     scene: int,
@@ -104,12 +106,29 @@ def _short(
     extra: tuple[float, float],
     nodes: NDArray[np.int64],
     bounds: Array,
-) -> bool:
-    """Whether a place in path coordinates lacks the margin."""
+) -> tuple[float, bool]:
+    """Distance of a place in path coordinates to the nearest obstacle, and whether it lacks the margin."""
     px, py, pz = world_place(frame, along, left, up)
     d, gx, gy, gz, _ = nearest_obstacle(solids, tree, scene, px, py, pz, nodes, bounds)
-    sigma = sigma_along(covariance, gx, gy, gz)
-    return bool(radius_m + k * sigma + min(extra[0], extra[1] * sigma) > d)
+    return d, _need(sigma_along(covariance, gx, gy, gz), k, radius_m, extra) > d
+
+
+@compiled
+def _need(sigma: float, k: float, radius_m: float, extra: tuple[float, float]) -> float:
+    """Distance to keep where the position has a sigma towards the obstacle [m]."""
+    return radius_m + k * sigma + min(extra[0], extra[1] * sigma)
+
+
+@compiled
+def _sigma_bounds(covariance: Array) -> tuple[float, float]:
+    """Bounds on sigma over all directions (Gershgorin)."""
+    least, most = np.inf, 0.0
+    for a in range(3):
+        beside = 0.0
+        for b in range(3):
+            beside += abs(covariance[a, b]) if b != a else 0.0
+        least, most = min(least, covariance[a, a] - beside), max(most, covariance[a, a] + beside)
+    return math.sqrt(max(least, 0.0)), math.sqrt(most)
 
 
 @compiled
@@ -136,6 +155,9 @@ def _pull(
         scene = 0 if len(scene_start) == 2 else run
         for uav in range(uavs):
             c, y, z = covariance[run, uav], lanes[uav, 0], lanes[uav, 1]
+            sigmas = _sigma_bounds(c)
+            least = _need(sigmas[0], k, radius_m, extra) - ROUNDING_M
+            large = _need(sigmas[1], k, radius_m, extra) + ROUNDING_M
             ahead = 0.0
             for s in range(stations - 1, -1, -1):
                 left, up = out[run, uav, s]
@@ -148,6 +170,9 @@ def _pull(
                     continue
                 place, pulled, blocked = along[run, uav] + s * step_m, 0.0, -1.0
                 step = 1
+                # A metre of way changes the distance by no more than a metre: places nearer than that to one
+                # that was asked about need not be asked about.
+                free, short = 0.0, np.inf
                 while True:
                     if blocked >= 0.0:
                         # To the margin itself: what jumps by a step from plan to plan would be flown.
@@ -159,11 +184,18 @@ def _pull(
                         step += 1
                     else:
                         break
-                    kept = 1.0 - want / size
-                    if _short(
-                        solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
-                        extra, nodes, bounds,
-                    ):  # fmt: skip
+                    lacks = want >= short
+                    if not lacks and want > free:
+                        kept = 1.0 - want / size
+                        d, lacks = _room(
+                            solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
+                            extra, nodes, bounds,
+                        )  # fmt: skip
+                        if lacks:
+                            short = want - max(0.0, least - d)
+                        else:
+                            free = want + max(0.0, d - large)
+                    if lacks:
                         blocked = want
                     else:
                         pulled = want
