@@ -75,9 +75,8 @@ _FACTORIES: dict[str, Callable[..., MakeBackend]] = {}
 _SHIPPED = {
     "osqp": ("napf_mpc.solvers.osqp_", "osqp"),
     "cvxpy": ("napf_mpc.solvers.cvxpy_", "napf-mpc[cvxpy]"),
-    **dict.fromkeys(
-        ("piqp", "daqp", "clarabel", "highs"), ("napf_mpc.solvers.qpsolvers_", "napf-mpc[solvers]")
-    ),
+    "piqp": ("napf_mpc.solvers.piqp_", "napf-mpc[solvers]"),
+    **dict.fromkeys(("daqp", "clarabel", "highs"), ("napf_mpc.solvers.qpsolvers_", "napf-mpc[solvers]")),
     "proxqp": ("napf_mpc.solvers.qpsolvers_", "qpsolvers[proxqp]"),
     "quadprog": ("napf_mpc.solvers.qpsolvers_", "qpsolvers[quadprog]"),
 }
