@@ -25,7 +25,8 @@ OURS = "QP, k = 3"
 PLANNERS: dict[str, tuple[str, list[str]]] = {
     "ORCA": ("orca", ["planner.k=0"]),
     "ORCA, k = 3": ("orca", ["planner.k=3"]),
-    "deterministic MPC": ("qp", ["planner.k=0"]),
+    # Distances that do not look at sigma: the whole of contact_extra_m.
+    "deterministic MPC": ("qp", ["planner.k=0", "planner.contact_extra_sigmas=1000"]),
     OURS: ("qp", ["planner.k=3"]),
 }
 """Label -> planner and its overrides."""

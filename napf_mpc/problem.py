@@ -678,9 +678,9 @@ class Planner(_Section):
     contact_price: float = Field(300.0, ge=0.0, le=1e9)
     """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]."""
     contact_extra_m: float = Field(0.75, ge=0.0, le=1e3)
-    """QP planner: most distance kept from obstacles on top of the margin."""
+    """QP planner: distance kept from obstacles on top of the margin, at most."""
     contact_extra_sigmas: float = Field(0.95, ge=0.0, le=1e3)
-    """QP planner: that distance in sigmas, as far as ``contact_extra_m`` goes."""
+    """QP planner: distance on top of the margin in sigmas; at most ``contact_extra_m``."""
     altitude_m: tuple[Coordinate, Coordinate] | None = None
     """QP planner: least and largest height to fly at; none by default."""
     influence_scale: float = Field(0.01, ge=1e-9, le=1e6)
@@ -696,7 +696,7 @@ class Planner(_Section):
     risk_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
     """With ``risk_per_mission``: correlation time of the position's error; by default navigation's own."""
     covariance: Literal["held", "expected", "propagated"] = "expected"
-    """QP planner and guidance: over the horizon, the covariance reported now; what the filter expects if fixes go on as now; or if none comes any more."""  # noqa: E501
+    """QP planner: over the horizon, the covariance reported now; what the filter expects if fixes go on as now; or if none comes any more. Guidance leaves room for what is expected at the horizon's end, or for the one now."""  # noqa: E501
     inflation: Literal["shift", "range"] = "shift"
     """k sigma shifts the distance to the obstacle, or only widens the range of influence."""
     sigma: Literal["directional", "largest", "rms", "chi2"] = "directional"

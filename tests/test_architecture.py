@@ -48,6 +48,7 @@ HOMES = {
     "osqp": {"solvers/osqp_.py"},
     "cvxpy": {"solvers/cvxpy_.py"},
     "qpsolvers": {"solvers/qpsolvers_.py"},
+    "piqp": {"solvers/piqp_.py"},
     "highspy": {"solvers/qpsolvers_.py"},
     "numba": {"jit.py"},
     "casadi": {"vehicle/quadrotor.py", "vehicle/codegen.py"},

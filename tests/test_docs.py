@@ -28,6 +28,11 @@ def rows() -> dict[str, list[list[str]]]:
     return found
 
 
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.name)
+def test_no_page_has_a_gap_to_be_filled_in(page: Path) -> None:
+    assert "@@" not in page.read_text(encoding="utf-8")
+
+
 def test_every_equation_has_a_function_and_a_test() -> None:
     table = rows()
     assert table.keys() == {str(number) for number in range(1, 40)} | {"3.2", "text"}

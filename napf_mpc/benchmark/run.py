@@ -9,14 +9,14 @@ import numpy as np
 
 from napf_mpc import store
 from napf_mpc.benchmark.contenders import Contender, Scene
-from napf_mpc.benchmark.growth import Point, Study
+from napf_mpc.benchmark.growth import Point, Study, growth
 from napf_mpc.benchmark.planners import Pilot, PlannerRow, installed_pilots, measure_planner
 from napf_mpc.benchmark.scaling import grown
 from napf_mpc.benchmark.solvers import ALONE, Row, installed, measure, summaries
 from napf_mpc.benchmark.steps import StepTime
 from napf_mpc.benchmark.tables import machine, planner_tables, scaling_tables, tables, write
 from napf_mpc.block import check_campaign
-from napf_mpc.plot import draw_growth, draw_solvers, draw_step_times
+from napf_mpc.plot import Curve, draw_growth, draw_solvers, draw_step_times
 from napf_mpc.problem_file import load_problem
 from napf_mpc.report import Rows
 
@@ -159,5 +159,15 @@ def benchmark_scaling(
                 paths |= dict.fromkeys(write(out, "scaling", rows, scaling_tables(points, studies, flights)))
         if out is not None:
             note = f"{flights} {machine()}"
-            paths |= dict.fromkeys(draw_growth(points, studies, out, "scaling", note))
+            curves = {name: _curve(studies[name], own) for name, own in points.items()}
+            paths |= dict.fromkeys(draw_growth(curves, out, "scaling", note))
     return scaling_tables(points, studies, flights), list(paths)
+
+
+def _curve(study: Study, points: list[Point]) -> Curve:
+    """What the figure shows of a study."""
+    fit = growth(points)
+    return Curve(
+        study.grows, [point.size for point in points], [1e-3 * point.cost_us for point in points],
+        [1e-3 * point.p99_us for point in points], fit.exponent, 1e-3 * fit.level_us,
+    )  # fmt: skip

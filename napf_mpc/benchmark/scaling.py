@@ -1,8 +1,8 @@
 """How the cost grows: with UAVs in lock-step, UAVs of a formation, obstacles, the horizon, and missions.
 
 Control steps are timed on closed-loop flights behind the navigation filter, from a time on at which obstacles
-are near. A size whose flight would take much longer than what was asked for is left out, and so are those
-beyond it.
+are near. A size whose flight is expected to take longer than asked for is left out, and so are those beyond
+it; the smallest size is flown once more before, to load compiled code.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from napf_mpc.closed_loop import Scenario, build_scenario
 from napf_mpc.planners.mpc import QpPlanner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
+from napf_mpc.streams import Stream, generator
 from napf_mpc.world.obstacles import ObstacleSet
 
 BASE: dict[str, object] = {"navigation.filter": "kalman", "simulation.time_limit_s": 20.0}
@@ -31,7 +32,7 @@ FROM_S = 10.0
 AREA_M2 = 90.0
 """Area for one obstacle: the density of study_40s."""
 CLEAR_M = 8.0
-"""No obstacle of a growing field is nearer to the start than this [m]."""
+"""No obstacle of a growing field has its centre nearer to the start than this [m]."""
 SLOT_M = 6.0
 """Distance of the slots of a growing formation [m]."""
 
@@ -72,12 +73,15 @@ def _obstacles(size: int, seed: int) -> Point:
 
 def field_of(count: int, seed: int) -> ObstacleSet:
     """Spheres of 0.5 to 2 m in a square field around the start, at the density of study_40s."""
-    rng = np.random.default_rng([seed, count])
-    half = 0.5 * math.sqrt(AREA_M2 * count) + CLEAR_M
-    centres = rng.uniform((-half, -half, -3.0), (half, half, 3.0), (count, 3))
-    beside = np.hypot(centres[:, 0], centres[:, 1]) < CLEAR_M
-    centres[beside, :2] *= -1.0
-    centres[beside, 0] = half
+    rng = generator(seed, count, Stream.SCENE)
+    half = 0.5 * math.sqrt(AREA_M2 * count + math.pi * CLEAR_M**2)
+    centres = np.empty((count, 3))
+    drawn = 0
+    while drawn < count:
+        more = rng.uniform((-half, -half, -3.0), (half, half, 3.0), (count - drawn, 3))
+        more = more[np.hypot(more[:, 0], more[:, 1]) >= CLEAR_M]
+        centres[drawn : drawn + len(more)] = more
+        drawn += len(more)
     return ObstacleSet.from_spheres(centres[None], rng.uniform(0.5, 2.0, (1, count)))
 
 

@@ -17,7 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 from napf_mpc import store
 from napf_mpc.benchmark.contenders import OSQP, REFERENCE, REFERENCE_SETTINGS
 from napf_mpc.benchmark.growth import Point, Study, growth
-from napf_mpc.benchmark.planners import PlannerRow
+from napf_mpc.benchmark.planners import SKIP, PlannerRow
 from napf_mpc.benchmark.solvers import CORRECT, Summary
 from napf_mpc.provenance import processor
 from napf_mpc.report import Rows
@@ -112,8 +112,8 @@ def planner_tables(rows: Sequence[PlannerRow], flights: str) -> list[Rows]:
     """One table a scene."""
     notes = (
         flights,
-        "Thread-CPU microseconds of a control step for one formation; late: wall time beyond the planner's "
-        "period.",
+        "Thread-CPU microseconds of a control step for one formation, without the first "
+        f"{SKIP} of a mission; late: wall time beyond the planner's period.",
         "Mission: processor milliseconds of one of those flown in lock-step, with its verdict; planning: the "
         "planner's part of it.",
         machine(),

@@ -53,9 +53,9 @@ class Gaps:
     normal: Array
     """(run, uav, N, M, 3) unit gradient of the distance; zero without."""
     margin: Array
-    """(run, uav, N, M) k sigma [m]."""
+    """(run, uav, N, M) k sigma, or the exact margin of a sphere or cylinder [m]."""
     sigma: Array
-    """(run, uav, N, M) standard deviation of the position in the direction of the normal [m]."""
+    """(run, uav, N, M) standard deviation of the position as the inflation reads it [m]."""
     shifted: Array
     """(run, uav, N, M) distance that enters the potential field, rho_bar; +inf without [m]."""
     influence: Array
@@ -290,6 +290,19 @@ class _Shell:
         return gaps
 
 
+def check_extra(extra_m: float, extra_sigmas: float | None) -> None:
+    """Raise ConstraintError unless a distance on top of the margin is one, see :func:`extra_distance`."""
+    if not (math.isfinite(extra_m) and extra_m >= 0.0):
+        raise ConstraintError(f"extra_m = {extra_m!r}, must be >= 0")
+    if extra_sigmas is not None and not (math.isfinite(extra_sigmas) and extra_sigmas >= 0.0):
+        raise ConstraintError(f"extra_sigmas = {extra_sigmas!r}, must be >= 0, or None")
+
+
+def extra_distance(extra_m: float, extra_sigmas: float | None, sigma: Array) -> Array | float:
+    """Distance on top of the margin: so many sigmas, at most so many metres; without sigmas those [m]."""
+    return extra_m if extra_sigmas is None else np.minimum(extra_m, extra_sigmas * sigma)
+
+
 @dataclass(frozen=True)
 class ObstacleContact(_Shell):
     """Contact shell: stay k sigma clear of the surface, ``rho_bar >= extra``.
@@ -313,8 +326,7 @@ class ObstacleContact(_Shell):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.extra_sigmas is not None and not self.extra_sigmas >= 0.0:
-            raise ConstraintError(f"extra_sigmas = {self.extra_sigmas!r}, must be >= 0, or None")
+        check_extra(self.extra_m, self.extra_sigmas)
         if self.opening_mps is not None and not self.opening_mps > 0.0:
             raise ConstraintError(f"opening_mps = {self.opening_mps!r}, must be > 0, or None")
 
@@ -331,9 +343,7 @@ class ObstacleContact(_Shell):
 
     def _extra(self, gaps: Gaps) -> Array | float:
         """Distance on top of the margin, one number or (run, uav, N, M) [m]."""
-        if self.extra_sigmas is None:
-            return self.extra_m
-        return np.minimum(self.extra_m, self.extra_sigmas * gaps.sigma)
+        return extra_distance(self.extra_m, self.extra_sigmas, gaps.sigma)
 
     def rows(self, horizon: Horizon) -> LinearRows:
         """Rows ``n^T p >= n^T p_lin - rho_bar(p_lin) + extra - s`` [m]."""

@@ -12,13 +12,12 @@ unit gradient n of the distance d the shifted distance is
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.constraints.clearance import CONTACT_W1, CONTACT_W2
+from napf_mpc.constraints.clearance import CONTACT_W1, CONTACT_W2, check_extra, extra_distance
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.safety_distance import Inflation
@@ -42,7 +41,9 @@ class MovingObstacleContact:
     reach_m: float = 10.0
     """Obstacles with a shifted distance of this or more are left out [m]."""
     extra_m: float = 0.0
-    """Distance kept on top of the margin [m]."""
+    """Distance kept on top of the margin [m], ..."""
+    extra_sigmas: float | None = None
+    """... or this many sigmas of the distance, if that is less. None keeps ``extra_m``."""
     w1: float = CONTACT_W1
     """Linear price of the slack [1/(m s)]."""
     w2: float = CONTACT_W2
@@ -53,8 +54,7 @@ class MovingObstacleContact:
             raise ConstraintError(
                 f"obstacles = {self.obstacles!r} and reach_m = {self.reach_m!r}: must be >= 1 and > 0"
             )
-        if not (math.isfinite(self.extra_m) and self.extra_m >= 0.0):
-            raise ConstraintError(f"extra_m = {self.extra_m!r}, must be >= 0")
+        check_extra(self.extra_m, self.extra_sigmas)
 
     @property
     def name(self) -> str:
@@ -74,14 +74,14 @@ class MovingObstacleContact:
             for axis in range(3):
                 along += normal[..., axis] * horizon.position[..., None, axis]
             jac[..., :found, :] = normal
-            lower[..., :found] = along + (self.extra_m - shifted)
+            lower[..., :found] = along - shifted
         slack = (*horizon.shape, 1)
         return LinearRows(
             "position", jac, lower, None, np.full(slack, self.w1), np.full(slack, self.w2), shared_slack=True
         )
 
     def _nearest(self, horizon: Horizon, tracks: Tracks, inflation: Inflation) -> tuple[Array, Array]:
-        """Normals (run, uav, N, m, 3) and shifted distances (run, uav, N, m), by index; +inf without."""
+        """Normals (run, uav, N, m, 3) and shifted distances less the extra (run, uav, N, m), by index."""
         centres, spread = tracks.predicted(np.cumsum(horizon.step_s))
         centres, spread = centres.transpose(0, 2, 1, 3)[:, None], spread.transpose(0, 2, 1, 3, 4)[:, None]
         distance, normal = round_distance(
@@ -96,8 +96,10 @@ class MovingObstacleContact:
             spread = np.broadcast_to(spread, (*horizon.shape, tracks.count, 3, 3))
             spread = np.take_along_axis(spread, few[..., None, None], -3)
         relative = horizon.covariance[:, :, :, None] + spread
-        shifted = distance - inflation.margin(relative, normal[..., None, :])[..., 0]
-        shifted = np.where(shifted < self.reach_m, shifted, np.inf)
+        sigma = replace(inflation, k=1.0).margin(relative, normal[..., None, :])[..., 0]
+        shifted = distance - inflation.k * sigma
+        extra = extra_distance(self.extra_m, self.extra_sigmas, sigma)
+        shifted = np.where(shifted < self.reach_m, shifted - extra, np.inf)
         # Rows in the order of their obstacles: those that keep their places keep a warm start warm.
         chosen = np.argsort(shifted, axis=-1, kind="stable")[..., : self.obstacles]
         chosen = np.sort(chosen, axis=-1)

@@ -118,14 +118,14 @@ class CovarianceForecast:
         return out
 
     def change(self, ahead_s: Array, with_fixes: bool) -> Array:
-        """Factor (run, uav, N, 3) from the variance now to that of then; 1 where now it is none.
+        """Factor (run, uav, N, 3) from the variance now to that of then; 1, held, where there is none.
 
         Parameters are those of :meth:`variance`.
         """
         now = self.packed[..., None, :, 0]
-        # A negative difference of rounding must not become a factor.
-        then = np.maximum(self.variance(ahead_s, with_fixes), 0.0)
-        return np.where(now == 0.0, 1.0, then / np.where(now == 0.0, 1.0, now))
+        factor = self.variance(ahead_s, with_fixes) / np.where(now > 0.0, now, np.inf)
+        # What is not above zero is rounding, and would say "certain"; it says that nothing is known.
+        return np.where(np.isfinite(factor) & (factor > 0.0), factor, 1.0)
 
 
 @compiled

@@ -9,12 +9,14 @@ formation slows, holds in front of it, and if the hold lasts too long, gives up 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets, synchronisation_error
+from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import SolidBoxes, frame_of, solid_boxes
@@ -27,6 +29,34 @@ from napf_mpc.safety_distance import Inflation, rms_sigma
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
+
+
+def guidance_covariance(
+    nav: NavSolution,
+    trusted: NDArray[np.bool_],
+    ahead: Array,
+    asked: Literal["held", "expected", "propagated"],
+) -> Array:
+    """Covariance (run, uav, 3, 3) for which guidance leaves room [m^2].
+
+    What lies beyond the planner's horizon is passed when navigation is as certain as it will be at its end,
+    if fixes go on and ``planner.covariance`` asks for that; otherwise, and in an outage, as certain as now.
+
+    Parameters
+    ----------
+    nav : NavSolution
+        As reported.
+    trusted : array of bool, shape (run, uav)
+        Where it may be used; elsewhere the answer is a unit matrix.
+    ahead : array, shape (run, uav, 3, 3)
+        Covariance at the end of the horizon [m^2].
+    asked : str
+        ``planner.covariance``.
+    """
+    room = nav.position_covariance
+    if asked == "expected" and nav.forecast is not None:
+        room = np.where(nav.forecast.fixes[..., None, None], ahead, room)
+    return np.asarray(np.where(trusted[..., None, None], room, np.eye(3)))
 
 
 class Guidance:
@@ -53,7 +83,8 @@ class Guidance:
         self._frame = frame_of(self._path)
         self._slots = formation_offsets(problem.formation)
         self._lanes = np.ascontiguousarray(self._slots[:, 1:])
-        self._extra = problem.planner.contact_extra_m, problem.planner.contact_extra_sigmas
+        self._extra_m = problem.planner.contact_extra_m
+        self._extra_sigmas = problem.planner.contact_extra_sigmas
         self._min_separation = problem.vehicle.min_separation_m
         self._traffic = TrafficPace(
             self._path, problem.mission.speed_mps, problem.vehicle.radius_m, inflation
@@ -107,7 +138,7 @@ class Guidance:
         position : array, shape (run, uav, 3)
             Estimates [m].
         covariance : array, shape (run, uav, 3, 3)
-            Of the position [m^2].
+            Of the position, to leave room for; see :func:`guidance_covariance` [m^2].
         trusted : array of bool, shape (run, uav)
             Where the estimate may be used; elsewhere the last trusted one is.
         time_s : float
@@ -177,7 +208,8 @@ class Guidance:
         if taut:
             pulled, loose = pulled_taut(
                 self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
-                self._inflation.k, self._search.radius_m, self._extra, self.settings.taut_slope,
+                self._inflation.k, self._search.radius_m, self._extra_m, self._extra_sigmas,
+                self.settings.taut_slope,
             )  # fmt: skip
             self._taut = np.concatenate([pulled, loose[..., None]], axis=-1)
         self._hold(offset, elapsed_s)

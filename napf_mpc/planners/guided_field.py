@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from napf_mpc import apf
 from napf_mpc.formation import reference_speed, synchronisation_error
 from napf_mpc.navigation.solution import NavSolution
-from napf_mpc.planners.guidance import Guidance
+from napf_mpc.planners.guidance import Guidance, guidance_covariance
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_settings import GuidanceSettings
+from napf_mpc.planners.plan import stage_grid
 from napf_mpc.planners.planner import Command, Reason
 from napf_mpc.planners.potential_field import PotentialFieldPlanner
 from napf_mpc.problem import FormationMission, Problem
@@ -49,6 +50,10 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         super().__init__(problem, Inflation.of_problem(problem), "napf_guided")
         self.guidance = Guidance(problem, self.inflation, settings)
         self.guide: Guide | None = None
+        planner = problem.planner
+        grid = stage_grid(1.0 / planner.rate_hz, planner.horizon, planner.look_ahead_s)
+        # Of the QP planner: both leave the same room.
+        self._horizon_s = np.array([grid.sum()])
 
     def reset(self, obstacles: ObstacleSet, runs: int) -> None:
         """Take a new map and forget all plans."""
@@ -60,10 +65,8 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
         position, covariance, trusted = self._estimates(nav)
-        room = covariance
-        if settings.covariance == "expected":
-            ahead = nav.position_covariance_ahead(np.array([settings.look_ahead_s]), with_fixes=True)
-            room = np.where(trusted[..., None, None], ahead[:, :, 0], covariance)
+        ahead = nav.position_covariance_ahead(self._horizon_s, with_fixes=True)[:, :, 0]
+        room = guidance_covariance(nav, trusted, ahead, settings.covariance)
         guide = self.guidance.step(position, room, trusted, time_s, nav.tracks)
         self.guide = guide
         place = self._frame.to_path(position)

@@ -22,7 +22,7 @@ from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.cohesion import drawn_together
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
 from napf_mpc.planners.guess import cut_at_obstacles
-from napf_mpc.planners.guidance import Guidance
+from napf_mpc.planners.guidance import Guidance, guidance_covariance
 from napf_mpc.planners.guide import Guide
 from napf_mpc.planners.guided_field import waiting_reasons
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
@@ -78,7 +78,9 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     others: list[Constraint] = [apart] if neighbours else []
     if problem.world.moving:
         count = min(rows, len(problem.world.moving))
-        others.append(MovingObstacleContact(obstacles=count, w1=price, extra_m=settings.contact_extra_m))
+        extra_m, extra_sigmas = settings.contact_extra_m, settings.contact_extra_sigmas
+        moving = MovingObstacleContact(obstacles=count, w1=price, extra_m=extra_m, extra_sigmas=extra_sigmas)
+        others.append(moving)
     if settings.altitude_m is not None:
         low, high = settings.altitude_m
         others.append(AltitudeBand(low, high))
@@ -198,10 +200,8 @@ class QpPlanner:
         covariance = self._covariance(nav, trusted)
         guide = None
         if self._guidance is not None:
-            # What lies beyond the horizon is passed when navigation is as certain as it will be at its end,
-            # but not as lost as without fixes. Raw measurements jump by more than a taut way could gain.
-            stage = 0 if self.problem.planner.covariance == "propagated" else -1
-            room = covariance[:, :, stage]
+            room = guidance_covariance(nav, trusted, covariance[:, :, -1], self.problem.planner.covariance)
+            # Raw measurements jump by more than a taut way could gain.
             guide = self._guidance.step(state[..., POSITION], room, trusted, time_s, taut=nav.filtered)
         carried = self._carried(state, time_s)
         reference, way = self._references(state, carried, nav, covariance, trusted, guide)
@@ -242,7 +242,7 @@ class QpPlanner:
             solver_status=_WORDS[answer.status],
         )
 
-    def _doubt(self, nav: NavSolution, trusted: Mask, covariance: Array) -> Array:
+    def _to_be_corrected(self, nav: NavSolution, trusted: Mask, covariance: Array) -> Array:
         """Sigmas (run, uav, 3) along, left and up of what will prove to have been error [m].
 
         Of a measurement all of its error; of an estimate what the filter will have corrected at the end of
@@ -283,7 +283,7 @@ class QpPlanner:
     ) -> tuple[Array, Array]:
         """States (run, uav, N, 12) to track, and of the way that guidance has found."""
         place, times = state[..., POSITION], self._model.times_s
-        sigma = self._doubt(nav, trusted, covariance)
+        sigma = self._to_be_corrected(nav, trusted, covariance)
         share: Array | float = self.problem.planner.cohesion
         if guide is None:
             free = reference = way = self._slots.over(place, times, sigma)
@@ -328,7 +328,7 @@ class QpPlanner:
             position=cut_at_obstacles(guess[..., POSITION], self._obstacles),
             velocity=np.ascontiguousarray(guess[..., VELOCITY]),
             covariance=covariance,
-            common_factor=np.where(known, nav.common_factor, 0.0),
+            common_factor=np.where(known, _shared_ahead(nav, covariance), 0.0),
             obstacles=self._obstacles,
             frame=self._frame,
             problem=self.problem,
@@ -468,6 +468,20 @@ class QpPlanner:
 def _reasons(action: Codes, trusted: Mask) -> Codes:
     waiting = action > Action.TAIL
     return np.where(waiting, np.where(trusted, Reason.SOLVER, Reason.NAVIGATION), Reason.NONE).astype(np.int8)
+
+
+def _shared_ahead(nav: NavSolution, covariance: Array) -> Array:
+    """Factor (run, uav, 3, rank) of what UAVs share of a covariance (run, uav, N, 3, 3) at all stages [m].
+
+    What they share shrinks with the rest of an axis, at most as far as at the stage where that is smallest: a
+    relative position must not pass for more certain than it is. What grows is each UAV's own.
+    """
+    if not nav.common_factor.any():
+        return nav.common_factor
+    now = np.einsum("...ii->...i", nav.position_covariance)
+    least = np.einsum("...ii->...i", covariance).min(axis=2)
+    scale = np.sqrt(np.clip(least / np.where(now > 0.0, now, np.inf), 0.0, 1.0))
+    return np.asarray(nav.common_factor * scale[..., None])
 
 
 def _moved(states: Array, by: Array) -> Array:

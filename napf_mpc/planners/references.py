@@ -52,10 +52,11 @@ class SlotReference:
         times_s : array, shape (N,)
             From now [s].
         sigma_m : array, shape (run, uav, 3), or float
-            Standard deviation of position *measurements* along, left and up [m]. A distance e to the slot is
-            believed, and so asked for, by the part ``e^2 / (e^2 + sigma^2)`` of each axis: below sigma it is
-            mostly navigation error, and chasing that would move the truth off the slot. The error of a
-            filter's estimate does not depend on the estimate: there it is 0, and all is asked for.
+            Of what will prove to have been error, along, left and up [m]: all of a *measurement's* error. A
+            distance e to the slot is believed, and so asked for, by the part ``e^2 / (e^2 + sigma^2)`` of
+            each axis: below sigma it is mostly navigation error, and chasing that would move the truth off
+            the slot. The error of a filter's estimate does not depend on the estimate: there it is what the
+            filter expects to correct, and in the long run nothing.
         guide : Guide, optional
             Offsets from the lanes, and pace.
         """

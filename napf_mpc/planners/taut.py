@@ -45,7 +45,8 @@ def pulled_taut(
     covariance: Array,
     k: float,
     radius_m: float,
-    extra: tuple[float, float],
+    extra_m: float,
+    extra_sigmas: float,
     slope: float,
 ) -> tuple[Array, Array]:
     """Offsets as near to the lanes as the margins allow, and how loose they are.
@@ -70,8 +71,8 @@ def pulled_taut(
         Sigmas.
     radius_m : float
         Of a UAV [m].
-    extra : (float, float)
-        Distance on top of the margin: at most so many metres, and so many sigmas.
+    extra_m, extra_sigmas : float
+        Distance on top of the margin: so many sigmas, at most so many metres [m].
     slope : float
         At which a place leads back to the way, per metre of path.
 
@@ -86,13 +87,13 @@ def pulled_taut(
     loose = np.ones(profiles.shape[:3])
     _pull(
         obstacles.solids, obstacles.tree, obstacles.scene_start, along, step_m, lanes, frame, covariance, k,
-        radius_m, extra, slope * step_m, out, loose,
+        radius_m, extra_m, extra_sigmas, slope * step_m, out, loose,
     )  # fmt: skip
     return out, loose
 
 
 @compiled
-def _room(
+def _distance_and_lack(
     solids: Solids,
     tree: BoxTree,
     scene: int,
@@ -103,20 +104,22 @@ def _room(
     covariance: Array,
     k: float,
     radius_m: float,
-    extra: tuple[float, float],
+    extra_m: float,
+    extra_sigmas: float,
     nodes: NDArray[np.int64],
     bounds: Array,
 ) -> tuple[float, bool]:
     """Distance of a place in path coordinates to the nearest obstacle, and whether it lacks the margin."""
     px, py, pz = world_place(frame, along, left, up)
     d, gx, gy, gz, _ = nearest_obstacle(solids, tree, scene, px, py, pz, nodes, bounds)
-    return d, _need(sigma_along(covariance, gx, gy, gz), k, radius_m, extra) > d
+    need = _need(sigma_along(covariance, gx, gy, gz), k, radius_m, extra_m, extra_sigmas)
+    return d, not need <= d  # what is not a number lacks it
 
 
 @compiled
-def _need(sigma: float, k: float, radius_m: float, extra: tuple[float, float]) -> float:
+def _need(sigma: float, k: float, radius_m: float, extra_m: float, extra_sigmas: float) -> float:
     """Distance to keep where the position has a sigma towards the obstacle [m]."""
-    return radius_m + k * sigma + min(extra[0], extra[1] * sigma)
+    return radius_m + k * sigma + min(extra_m, extra_sigmas * sigma)
 
 
 @compiled
@@ -143,7 +146,8 @@ def _pull(
     covariance: Array,
     k: float,
     radius_m: float,
-    extra: tuple[float, float],
+    extra_m: float,
+    extra_sigmas: float,
     most: float,
     out: Array,
     loose: Array,
@@ -156,8 +160,8 @@ def _pull(
         for uav in range(uavs):
             c, y, z = covariance[run, uav], lanes[uav, 0], lanes[uav, 1]
             sigmas = _sigma_bounds(c)
-            least = _need(sigmas[0], k, radius_m, extra) - ROUNDING_M
-            large = _need(sigmas[1], k, radius_m, extra) + ROUNDING_M
+            least = _need(sigmas[0], k, radius_m, extra_m, extra_sigmas) - ROUNDING_M
+            large = _need(sigmas[1], k, radius_m, extra_m, extra_sigmas) + ROUNDING_M
             ahead = 0.0
             for s in range(stations - 1, -1, -1):
                 left, up = out[run, uav, s]
@@ -187,9 +191,9 @@ def _pull(
                     lacks = want >= short
                     if not lacks and want > free:
                         kept = 1.0 - want / size
-                        d, lacks = _room(
+                        d, lacks = _distance_and_lack(
                             solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
-                            extra, nodes, bounds,
+                            extra_m, extra_sigmas, nodes, bounds,
                         )  # fmt: skip
                         if lacks:
                             short = want - max(0.0, least - d)

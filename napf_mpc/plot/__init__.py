@@ -6,13 +6,14 @@ Nothing here uses pyplot: no display, no global state, and every figure comes ou
 from napf_mpc.plot.animate import animation
 from napf_mpc.plot.compare import compare_figures
 from napf_mpc.plot.flight import run_figures
-from napf_mpc.plot.growth import draw_growth
+from napf_mpc.plot.growth import Curve, draw_growth
 from napf_mpc.plot.overview import Mission, paths_overview, pick_missions
 from napf_mpc.plot.paper import paper_figures
 from napf_mpc.plot.solvers import draw_solvers, draw_step_times
 from napf_mpc.plot.trade import draw_fronts
 
 __all__ = [
+    "Curve",
     "Mission",
     "animation",
     "compare_figures",

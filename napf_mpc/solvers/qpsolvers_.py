@@ -1,4 +1,4 @@
-"""Every solver that qpsolvers knows and that is installed, through its one interface."""
+"""Solvers that qpsolvers knows and that are installed, through its one interface."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from napf_mpc.solvers.solver import Answer, MakeBackend, Warm
 DENSE = ("daqp", "quadprog")
 """Solvers that take dense matrices only."""
 DEFAULTS: dict[str, dict[str, Any]] = {
-    "piqp": {"eps_abs": 1e-9, "eps_rel": 1e-9, "check_duality_gap": True},
     "clarabel": {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10},
     "proxqp": {"eps_abs": 1e-9, "eps_rel": 0.0},
     # It solves semi-definite programs by proximal steps only.

@@ -116,8 +116,12 @@ def test_the_extra_distance_is_metres_at_most_and_sigmas_up_to_there(
         )
     with pytest.raises(ConstraintError, match="extra_sigmas = -1"):
         ObstacleContact(extra_sigmas=-1.0)
-    with pytest.raises(ConstraintError, match="extra_sigmas = nan"):
-        ObstacleContact(extra_sigmas=math.nan)
+    for value in (math.nan, math.inf):
+        with pytest.raises(ConstraintError, match=f"extra_sigmas = {value}"):
+            ObstacleContact(extra_sigmas=value)
+    for value in (math.nan, math.inf, -1.0):
+        with pytest.raises(ConstraintError, match=f"extra_m = {value}"):
+            ObstacleContact(extra_m=value)
 
 
 WORLDS: dict[str, tuple[Shape, tuple[float, float, float], float, tuple[float, float, float]]] = {

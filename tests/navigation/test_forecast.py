@@ -185,12 +185,17 @@ def test_correlations_are_held_and_variances_are_those_of_then(begin_s: float, w
     assert np.linalg.eigvalsh(ahead).min() >= 0.0
 
 
-def test_what_is_certain_stays_certain() -> None:
-    """A variance of zero has no factor to that of later."""
+def test_where_there_is_no_factor_the_variance_is_held() -> None:
+    """A variance of zero has none to that of later, nor has one to what is not above zero."""
     nav = Pilot(GaussMarkov()).fly(1.0)[-1]
     assert nav.forecast is not None
     certain = replace(nav.forecast, packed=np.zeros_like(nav.forecast.packed))
     np.testing.assert_array_equal(certain.change(AHEAD_S, with_fixes=True), 1.0)
+    for value in (-1e-3, np.nan):
+        spoilt = replace(nav.forecast, packed=np.where(np.arange(10) == 4, value, nav.forecast.packed))
+        factor = spoilt.change(np.array([0.02, 100.0]), with_fixes=False)
+        assert np.isfinite(factor).all()
+        assert (factor > 0.0).all()
 
 
 def test_without_a_law_the_report_is_held() -> None:

@@ -15,6 +15,7 @@ from napf_mpc.constraints.constraint import Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, TiltLimit
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.guidance import guidance_covariance
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guided_field import GuidedNapfPlanner
 from napf_mpc.planners.mpc import QpPlanner, default_constraints
@@ -172,7 +173,7 @@ def test_a_large_east_sigma_leaves_the_height_believed(heading_deg: float, axis:
     covariance[..., :3, :3] = np.diag([10.0**2, 0.2**2, 0.1**2])
     solution = replace(solution, covariance=covariance)
     everybody = solution.trusted()
-    sigma = planner._doubt(solution, everybody, planner._covariance(solution, everybody))
+    sigma = planner._to_be_corrected(solution, everybody, planner._covariance(solution, everybody))
     assert sigma.shape == (1, 4, 3)
     if axis is None:
         turn = math.radians(heading_deg)
@@ -187,15 +188,15 @@ def test_a_large_east_sigma_leaves_the_height_believed(heading_deg: float, axis:
     np.testing.assert_allclose(sigma, np.broadcast_to(wanted, (1, 4, 3)), rtol=1e-9)
     estimate = replace(solution, filtered=True)
     covariance = planner._covariance(estimate, everybody)
-    np.testing.assert_array_equal(planner._doubt(estimate, everybody, covariance), 0.0)
+    np.testing.assert_array_equal(planner._to_be_corrected(estimate, everybody, covariance), 0.0)
     # Three quarters of the variance, and so sqrt(3)/2 of sigma, are gone at the end of the horizon.
     covariance[:, :, -1] *= 0.25
-    half = planner._doubt(estimate, everybody, covariance)
+    half = planner._to_be_corrected(estimate, everybody, covariance)
     np.testing.assert_allclose(half, math.sqrt(0.75) * sigma, rtol=1e-9)
     covariance[:, :, -1] *= 16.0
-    np.testing.assert_array_equal(planner._doubt(estimate, everybody, covariance), 0.0)
+    np.testing.assert_array_equal(planner._to_be_corrected(estimate, everybody, covariance), 0.0)
     nobody = np.zeros_like(everybody)
-    np.testing.assert_array_equal(planner._doubt(solution, nobody, covariance), 0.0)
+    np.testing.assert_array_equal(planner._to_be_corrected(solution, nobody, covariance), 0.0)
     # Of the missing metre of height all but a hundredth is asked for, and so it is climbed.
     climbed = planner.build(solution, 0.0).reference[..., 4]
     np.testing.assert_allclose(climbed, 1.0 / 1.01, rtol=1e-9)
@@ -456,7 +457,7 @@ def test_the_margin_of_a_stage_is_that_of_the_covariance_then(asked: str) -> Non
     sigma = np.sqrt(np.array([np.einsum("...ii->...i", horizon.covariance) for horizon in seen[10:]]))
     grown = 3.0 * (sigma - sigma[:, :, :, :1])
     assert sigma.shape[1:] == (2, 4, 20, 3)
-    assert (np.diff(sigma, axis=3) >= -1e-5).all() == (asked != "expected")
+    assert (np.diff(sigma, axis=3) >= -1e-3).all() == (asked != "expected")
     if asked == "held":
         np.testing.assert_array_equal(grown, 0.0)
     elif asked == "expected":
@@ -512,7 +513,75 @@ def test_guidance_leaves_room_for_the_sigma_that_is_expected_at_the_end_of_the_h
     if asked == "expected":
         np.testing.assert_allclose(share, 0.76, atol=0.02)
     else:
-        np.testing.assert_allclose(share, 1.0, rtol=1e-9 if asked == "held" else 0.05)
+        np.testing.assert_allclose(share, 1.0, rtol=1e-9)
+
+
+def test_in_an_outage_guidance_leaves_room_for_the_sigma_now() -> None:
+    """What is expected then is what no fix ever leads to, and one refused fix is no reason for a detour."""
+    seen = []
+
+    class Watch:
+        name = "watch"
+
+        def rows(self, horizon: Horizon) -> LinearRows:
+            seen.append(horizon)
+            return TiltLimit(1.0).rows(horizon)
+
+    flown = problem(
+        navigation={"filter": "kalman"}, planner={"kind": "qp"}, mission={"length_m": 12.0},
+        simulation={"time_limit_s": 0.3},
+    )  # fmt: skip
+    planner = QpPlanner(flown, constraints=[*default_constraints(flown), Watch()])
+    given: list[NavSolution] = []
+    fly = planner.step
+
+    def watched(solution: NavSolution, time_s: float) -> Command:
+        given.append(solution)
+        return fly(solution, time_s)
+
+    planner.step = watched  # type: ignore[method-assign]
+    simulate(flown, planner, seed=101, runs=2)
+    solution = given[-1]
+    assert solution.forecast is not None
+    everybody = solution.trusted()
+    ahead = 0.5 * solution.position_covariance
+    used = np.zeros_like(everybody)
+    used[0] = True
+    lost = replace(solution, forecast=replace(solution.forecast, fixes=used))
+    room = guidance_covariance(lost, everybody, ahead, "expected")
+    np.testing.assert_array_equal(room[0], ahead[0])
+    np.testing.assert_array_equal(room[1], solution.position_covariance[1])
+    nobody = np.zeros_like(everybody)
+    np.testing.assert_array_equal(guidance_covariance(lost, nobody, ahead, "expected")[0, 0], np.eye(3))
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 1.0])
+@pytest.mark.parametrize("asked", ["held", "expected", "propagated"])
+def test_a_shared_error_makes_no_relative_position_more_certain_than_it_is(share: float, asked: str) -> None:
+    """Along the horizon the shared part shrinks with the whole: what is left of two UAVs is a covariance."""
+    flown = problem(
+        navigation={"filter": "kalman", "common_mode_share": share},
+        planner={"kind": "qp", "covariance": asked},
+        mission={"length_m": 12.0}, simulation={"time_limit_s": 4.0},
+    )  # fmt: skip
+    least, now = [], []
+
+    class Watch:
+        name = "watch"
+
+        def rows(self, horizon: Horizon) -> LinearRows:
+            factor = horizon.common_factor
+            assert factor.any()
+            cross = factor[:, 0] @ factor[:, 1].transpose(0, 2, 1)
+            both = horizon.covariance[:, 0] + horizon.covariance[:, 1]
+            relative = both - (cross + cross.transpose(0, 2, 1))[:, None]
+            least.append(np.linalg.eigvalsh(relative).min())
+            now.append(np.linalg.eigvalsh(both).max())
+            return TiltLimit(1.0).rows(horizon)
+
+    simulate(flown, QpPlanner(flown, constraints=[*default_constraints(flown), Watch()]), seed=101, runs=2)
+    assert len(least) == 40
+    assert (np.array(least) >= -1e-9 * np.array(now)).all()
 
 
 def test_rows_that_do_not_fit_are_an_error_and_not_a_fall_back() -> None:

@@ -1,5 +1,7 @@
 """A guide's way pulled taut: to the margin and no farther, on the same side, and back in time."""
 
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -7,9 +9,9 @@ from numpy.typing import NDArray
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import frame_of
-from napf_mpc.planners.taut import pulled_taut
+from napf_mpc.planners.taut import NEAR_M, SAME_M, STEPS, pulled_taut
 from napf_mpc.world.obstacles import ObstacleSet
-from napf_mpc.world.shapes import Box, Shape, Sphere
+from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 
 Array = NDArray[np.float64]
 
@@ -26,7 +28,7 @@ def pulled(
     """Offsets (station, 2) and how loose they are, of one UAV that starts at 0."""
     offsets, loose = pulled_taut(
         profile[None, None], np.zeros((1, 1)), STEP, LANE, frame_of(PATH), ObstacleSet.from_shapes(shapes),
-        SIGMA**2 * np.eye(3)[None, None], K, RADIUS, extra, slope,
+        SIGMA**2 * np.eye(3)[None, None], K, RADIUS, *extra, slope,
     )  # fmt: skip
     return offsets[0, 0], loose[0, 0]
 
@@ -87,6 +89,72 @@ def test_it_leads_back_at_a_slope_that_can_be_flown() -> None:
     assert offsets[30, 0] > 4.0  # not yet beside the wall, but on the way out
     # Behind the wall nothing asks for more.
     np.testing.assert_array_equal(offsets[46:], 0.0)
+
+
+WORLDS: dict[str, list[Shape]] = {
+    "nothing": [],
+    "spheres": [Sphere((6.0 * i, 7.0 * ((3 * i) % 7 - 3), 0.5 * i - 2.0), 0.5 + 0.2 * i) for i in range(9)],
+    "trunks": [Cylinder((5.0 * i, 6.0 * ((2 * i) % 5 - 2)), 0.4 + 0.1 * i) for i in range(9)],
+    "boxes": [Box((8.0 * i, 8.0 * ((2 * i) % 5 - 2), 0.0), (3.0, 2.0, 4.0), 0.3 * i) for i in range(6)],
+    "a courtyard": [
+        Prism(
+            (
+                np.array([(10.0, -9.0), (40.0, -9.0), (40.0, 14.0), (10.0, 14.0)]),
+                np.array([(14.0, -5.0), (14.0, 10.0), (36.0, 10.0), (36.0, -5.0)]),
+            ),
+            -9.0,
+            9.0,
+        )
+    ],
+}
+
+
+@pytest.mark.parametrize("k", [0.0, 1.0, 3.0])
+@pytest.mark.parametrize("name", WORLDS)
+def test_no_question_that_is_left_out_would_have_changed_anything(name: str, k: float) -> None:
+    """Covariances with correlated axes and one far larger than another; each place asked about by itself."""
+    rng = np.random.default_rng(7)
+    world = ObstacleSet.from_shapes(WORLDS[name])
+    for _ in range(8):
+        wide = rng.normal(0.0, 1.0, (3, 3)) * (0.9, 0.3, 0.1)
+        covariance = wide @ wide.T + 0.01 * np.eye(3)
+        profile = np.cumsum(rng.normal(0.0, 0.6, (STATIONS, 2)) * (1.0, 0.3), axis=0)
+        given = (
+            profile[None, None], np.zeros((1, 1)), STEP, LANE, frame_of(PATH), world, covariance[None, None],
+            k, RADIUS, 0.75, 0.95, 0.35,
+        )  # fmt: skip
+        quick = pulled_taut(*given)
+        slow = asked_everywhere(profile, world, covariance, k)
+        np.testing.assert_allclose(quick[0][0, 0], slow, atol=1e-9)
+
+
+def asked_everywhere(profile: Array, world: ObstacleSet, covariance: Array, k: float) -> Array:
+    """The same, every place by a question of its own."""
+    out = profile.copy()
+    ahead = 0.0
+    for s in range(STATIONS - 1, -1, -1):
+        left, up = profile[s]
+        size = math.sqrt(left * left + up * up)
+        limit = min(size - (ahead - 0.35 * STEP), size)
+        ahead = size
+        if size < SAME_M or limit <= 0.0:
+            continue
+        pulled, blocked = 0.0, -1.0
+        wants = [limit * step / STEPS for step in range(1, STEPS + 1)]
+        while wants or blocked - pulled > NEAR_M:
+            want = wants.pop(0) if blocked < 0.0 else 0.5 * (pulled + blocked)
+            kept = 1.0 - want / size
+            place = np.array([[[s * STEP, LANE[0, 0] + kept * left, LANE[0, 1] + kept * up]]])
+            near = world.near(place, np.array([[1e3]]), 1)
+            distance, normal = float(near.distance[0, 0, 0]), near.gradient[0, 0, 0]
+            sigma = math.sqrt(max(float(normal @ covariance @ normal), 0.0))
+            if len(world) and RADIUS + k * sigma + min(0.75, 0.95 * sigma) > distance:
+                blocked, wants = want, []
+            else:
+                pulled = want
+        ahead = size - pulled
+        out[s] = profile[s] * (1.0 - pulled / size)
+    return out
 
 
 def test_uavs_that_hold_stay_on_the_guides_way() -> None:
