@@ -60,7 +60,7 @@ def growth_figure(curves: Mapping[str, Curve], note: str = "") -> Figure:
             line = [curve.level_ms * end**curve.exponent for end in ends]
             axes.plot(ends, line, color=GREY, linewidth=0.8, linestyle="--")
             words = f"fit: size$^{{{curve.exponent:.2f}}}$"
-            axes.text(0.97, 0.05, words, color=GREY, ha="right", transform=axes.transAxes)
+            axes.text(0.04, 0.95, words, color=GREY, va="top", transform=axes.transAxes)
         for axis, log in ((axes.xaxis, axes.set_xscale), (axes.yaxis, axes.set_yscale)):
             log("log")
             axis.set_minor_formatter(NullFormatter())
