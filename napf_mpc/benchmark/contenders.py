@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from napf_mpc.solvers.batch import BatchSolver, make_batch_solver
+from napf_mpc.solvers.solver import SolverError
+
+T = TypeVar("T")
 
 REFERENCE, REFERENCE_SETTINGS = "piqp", {"eps_abs": 1e-10, "eps_rel": 1e-10, "check_duality_gap": True}
 """The solver whose first inputs count as true."""
@@ -35,6 +39,26 @@ class Contender:
             If its package is not installed.
         """
         return make_batch_solver(self.solver, **self.settings)
+
+
+def present(known: Mapping[str, T], make: Callable[[T], object], tell: Callable[[str], None]) -> dict[str, T]:
+    """Those that can be made; ``tell`` is told of the others.
+
+    Raises
+    ------
+    SolverError
+        If none can.
+    """
+    found = {}
+    for label, one in known.items():
+        try:
+            make(one)
+            found[label] = one
+        except SolverError as error:
+            tell(f"{label} is left out: {error}")
+    if not found:
+        raise SolverError(f"none of these is installed: {'; '.join(known)}")
+    return found
 
 
 CONTENDERS: dict[str, Contender] = {

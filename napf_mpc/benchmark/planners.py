@@ -8,15 +8,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from napf_mpc.benchmark.contenders import Scene
-from napf_mpc.benchmark.steps import StepTime, step_times
-from napf_mpc.block import fly_block
+from napf_mpc.benchmark.contenders import Scene, present
+from napf_mpc.benchmark.steps import StepTime, TimedPlanner, step_times
+from napf_mpc.block import simulate
 from napf_mpc.closed_loop import build_scenario
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.solvers.batch import make_batch_solver
-from napf_mpc.solvers.solver import SolverError
 
 TIMED_ALONE = 3
 """Missions whose steps are timed one mission at a time."""
@@ -32,6 +31,11 @@ class Pilot:
     """Name of a planner, see :data:`napf_mpc.planners.registry.PLANNERS`."""
     overrides: Mapping[str, object] = field(default_factory=dict)
     """Of the problem."""
+
+    @property
+    def solver(self) -> str:
+        """Name of the solver that it needs, if it plans by programs."""
+        return str(self.overrides.get("planner.solver", "kernel"))
 
 
 PILOTS: dict[str, Pilot] = {
@@ -83,16 +87,7 @@ def installed_pilots(pilots: Mapping[str, Pilot], tell: Callable[[str], None]) -
     SolverError
         If none is there.
     """
-    present = {}
-    for label, pilot in pilots.items():
-        try:
-            make_batch_solver(str(pilot.overrides.get("planner.solver", "kernel")))
-            present[label] = pilot
-        except SolverError as error:
-            tell(f"{label} is left out: {error}")
-    if not present:
-        raise SolverError(f"none of these is installed: {'; '.join(pilots)}")
-    return present
+    return present(pilots, lambda one: make_batch_solver(one.solver), tell)
 
 
 def measure_planner(
@@ -138,11 +133,10 @@ def measure_planner(
 
 
 def _together(problem: Problem, pilot: Pilot, missions: int, seed: int) -> tuple[float, float]:
-    """Processor time of a mission with its verdict [s], and the planner's part of a mission in flight."""
-    fly_block(problem, [pilot.planner], seed, range(1))  # compiles, or loads what is compiled
+    """Processor time of a mission with its verdict [s], and the planner's part of it."""
+    simulate(problem, pilot.planner, seed=seed)  # compiles, or loads what is compiled
+    timed = TimedPlanner(make_planner(pilot.planner, problem))
     began = time.process_time()
-    fly_block(problem, [pilot.planner], seed, range(missions))
+    simulate(problem, timed, seed=seed, runs=missions)
     whole = time.process_time() - began
-    scenario = build_scenario(problem, seed, range(missions))
-    planning = step_times(problem, make_planner(pilot.planner, problem), scenario, 0)
-    return whole / missions, min(1.0, 1e-6 * sum(step.cpu_us for step in planning) / whole)
+    return whole / missions, 1e-6 * sum(step.cpu_us for step in timed.times) / whole

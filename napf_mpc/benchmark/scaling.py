@@ -31,6 +31,8 @@ FROM_S = 10.0
 """Steps before this do not count: obstacles begin 20 m from the start, at 2 m/s [s]."""
 AREA_M2 = 90.0
 """Area for one obstacle: the density of study_40s."""
+MIDDLE_M = 30.0
+"""A growing field's middle: where the formation is half-way through the time that counts [m]."""
 CLEAR_M = 8.0
 """No obstacle of a growing field has its centre nearer to the start than this [m]."""
 SLOT_M = 6.0
@@ -72,13 +74,14 @@ def _obstacles(size: int, seed: int) -> Point:
 
 
 def field_of(count: int, seed: int) -> ObstacleSet:
-    """Spheres of 0.5 to 2 m in a square field around the start, at the density of study_40s."""
+    """Spheres of 0.5 to 2 m in a square field around where steps are timed, at the density of study_40s."""
     rng = generator(seed, count, Stream.SCENE)
-    half = 0.5 * math.sqrt(AREA_M2 * count + math.pi * CLEAR_M**2)
+    half = 0.5 * math.sqrt(AREA_M2 * count)
     centres = np.empty((count, 3))
     drawn = 0
     while drawn < count:
-        more = rng.uniform((-half, -half, -3.0), (half, half, 3.0), (count - drawn, 3))
+        low, high = (MIDDLE_M - half, -half, -3.0), (MIDDLE_M + half, half, 3.0)
+        more = rng.uniform(low, high, (count - drawn, 3))
         more = more[np.hypot(more[:, 0], more[:, 1]) >= CLEAR_M]
         centres[drawn : drawn + len(more)] = more
         drawn += len(more)

@@ -21,6 +21,7 @@ from napf_mpc.benchmark.contenders import (
     REFERENCE_SETTINGS,
     Contender,
     Scene,
+    present,
 )
 from napf_mpc.benchmark.programs import Step, flown
 from napf_mpc.errors import ProblemError
@@ -29,7 +30,6 @@ from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import Array, HorizonQp, Layout, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, make_batch_solver
 from napf_mpc.solvers.residuals import relative_residuals
-from napf_mpc.solvers.solver import SolverError
 from napf_mpc.vehicle.quadrotor import mixer_inverse, rotor_limit
 
 SOLVED = STATUSES.index(QpStatus.SOLVED)
@@ -77,16 +77,7 @@ def installed(contenders: Mapping[str, Contender], tell: Callable[[str], None]) 
         If none is there, or the reference is not.
     """
     make_batch_solver(REFERENCE, **REFERENCE_SETTINGS)
-    present = {}
-    for label, contender in contenders.items():
-        try:
-            contender.make()
-            present[label] = contender
-        except SolverError as error:
-            tell(f"{label} is left out: {error}")
-    if not present:
-        raise SolverError(f"none of these is installed: {'; '.join(contenders)}")
-    return present
+    return present(contenders, Contender.make, tell)
 
 
 def measure(

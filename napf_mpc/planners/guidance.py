@@ -9,7 +9,6 @@ formation slows, holds in front of it, and if the hold lasts too long, gives up 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,16 +30,11 @@ from napf_mpc.world.obstacles import ObstacleSet
 Array = NDArray[np.float64]
 
 
-def guidance_covariance(
-    nav: NavSolution,
-    trusted: NDArray[np.bool_],
-    ahead: Array,
-    asked: Literal["held", "expected", "propagated"],
-) -> Array:
+def guidance_covariance(nav: NavSolution, trusted: NDArray[np.bool_], ahead: Array | None) -> Array:
     """Covariance (run, uav, 3, 3) for which guidance leaves room [m^2].
 
     What lies beyond the planner's horizon is passed when navigation is as certain as it will be at its end,
-    if fixes go on and ``planner.covariance`` asks for that; otherwise, and in an outage, as certain as now.
+    if fixes go on. In an outage, or if nothing is expected, it is taken to be as certain as now.
 
     Parameters
     ----------
@@ -48,13 +42,11 @@ def guidance_covariance(
         As reported.
     trusted : array of bool, shape (run, uav)
         Where it may be used; elsewhere the answer is a unit matrix.
-    ahead : array, shape (run, uav, 3, 3)
-        Covariance at the end of the horizon [m^2].
-    asked : str
-        ``planner.covariance``.
+    ahead : array, shape (run, uav, 3, 3), or None
+        Covariance expected at the end of the horizon [m^2].
     """
     room = nav.position_covariance
-    if asked == "expected" and nav.forecast is not None:
+    if ahead is not None and nav.forecast is not None:
         room = np.where(nav.forecast.fixes[..., None, None], ahead, room)
     return np.asarray(np.where(trusted[..., None, None], room, np.eye(3)))
 

@@ -36,6 +36,8 @@ class SolidBoxes(NamedTuple):
 
     low: Array  # (solid, 3) along, left, up [m]
     high: Array  # (solid, 3)
+    order: NDArray[np.int64]  # (solid,) of each scene by low along, scene after scene
+    longest: float  # of all boxes along [m]
 
 
 def frame_of(path: PathFrame) -> Frame:
@@ -49,7 +51,10 @@ def solid_boxes(obstacles: ObstacleSet, path: PathFrame) -> SolidBoxes:
     lower[:, 2] = np.maximum(lower[:, 2], -ENDLESS_M)
     upper[:, 2] = np.minimum(upper[:, 2], ENDLESS_M)
     corners = np.stack([path.to_path(np.where(np.array(pick), upper, lower)) for pick in np.ndindex(2, 2, 2)])
-    return SolidBoxes(np.ascontiguousarray(corners.min(0)), np.ascontiguousarray(corners.max(0)))
+    low, high = np.ascontiguousarray(corners.min(0)), np.ascontiguousarray(corners.max(0))
+    scene = np.repeat(np.arange(obstacles.n_scenes), np.diff(obstacles.scene_start))
+    order = np.lexsort((low[:, 0], scene)).astype(np.int64)
+    return SolidBoxes(low, high, order, float((high - low)[:, 0].max(initial=0.0)))
 
 
 # Columns of `Sight.near`: where a solid is, the box in which it can matter, and what is round about it.
@@ -241,17 +246,38 @@ def gather(
     reach: float,
     found: NDArray[np.int64],
 ) -> int:
-    """Note the solids first ... stop - 1 that reach into a window of the plane; returns their number."""
+    """Note the solids first ... stop - 1 that reach into a window of the plane; returns their number.
+
+    They come in the order of their indices, and if there is no room for all, those of the smallest.
+    """
     count = 0
-    for i in range(first, stop):
-        if boxes.high[i, 0] < along_low - reach or boxes.low[i, 0] > along_high + reach:
+    begin, end = first, stop
+    while begin < end:
+        middle = (begin + end) // 2
+        if boxes.low[boxes.order[middle], 0] < along_low - reach - boxes.longest:
+            begin = middle + 1
+        else:
+            end = middle
+    for place in range(begin, stop):
+        i = boxes.order[place]
+        if boxes.low[i, 0] > along_high + reach:
+            break
+        if boxes.high[i, 0] < along_low - reach:
             continue
         if boxes.high[i, 1] < left_low - reach or boxes.low[i, 1] > left_high + reach:
             continue
+        at = count
         if count < len(found):
-            found[count] = i
-        count += 1
-    return min(count, len(found))
+            count += 1
+        elif i < found[count - 1]:
+            at = count - 1
+        else:
+            continue
+        while at > 0 and found[at - 1] > i:
+            found[at] = found[at - 1]
+            at -= 1
+        found[at] = i
+    return count
 
 
 @compiled

@@ -65,8 +65,10 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
         position, covariance, trusted = self._estimates(nav)
-        ahead = nav.position_covariance_ahead(self._horizon_s, with_fixes=True)[:, :, 0]
-        room = guidance_covariance(nav, trusted, ahead, settings.covariance)
+        ahead = None
+        if settings.covariance == "expected":
+            ahead = nav.position_covariance_ahead(self._horizon_s, with_fixes=True)[:, :, 0]
+        room = guidance_covariance(nav, trusted, ahead)
         guide = self.guidance.step(position, room, trusted, time_s, nav.tracks)
         self.guide = guide
         place = self._frame.to_path(position)

@@ -200,7 +200,8 @@ class QpPlanner:
         covariance = self._covariance(nav, trusted)
         guide = None
         if self._guidance is not None:
-            room = guidance_covariance(nav, trusted, covariance[:, :, -1], self.problem.planner.covariance)
+            expected = self.problem.planner.covariance == "expected"
+            room = guidance_covariance(nav, trusted, covariance[:, :, -1] if expected else None)
             # Raw measurements jump by more than a taut way could gain.
             guide = self._guidance.step(state[..., POSITION], room, trusted, time_s, taut=nav.filtered)
         carried = self._carried(state, time_s)

@@ -102,6 +102,18 @@ def test_the_margin_is_k_sigma_of_the_relative_position_and_grows_with_time() ->
     assert (np.diff(rows.lower[0, 0, :, 0]) > 0.0).all()
 
 
+@pytest.mark.parametrize(("extra_sigmas", "kept"), [(None, 0.4), (0.5, 0.25), (0.8, 0.4), (9.0, 0.4)])
+def test_the_extra_distance_is_metres_at_most_and_sigmas_of_the_distance(
+    extra_sigmas: float | None, kept: float
+) -> None:
+    """UAV and track together are certain to 0.5 m along x: sigmas of 0.3 and 0.4 m."""
+    covariance = np.diag([0.16] * 3 + [0.0] * 3)[None, None]
+    horizon = hover_at((0.0, 0.0, 0.0), tracks_of((4.0, 0.0, 0.0), covariance=covariance), 0.3)
+    rows = MovingObstacleContact(Inflation(2.0), extra_m=0.4, extra_sigmas=extra_sigmas).rows(horizon)
+    assert rows.lower is not None
+    np.testing.assert_allclose(rows.lower[0, 0, :, 0], 2.0 * 0.5 + kept + 1.0 + RADIUS - 4.0, atol=1e-12)
+
+
 def test_only_the_uncertainty_along_the_normal_counts() -> None:
     covariance = np.zeros((1, 1, 6, 6))
     covariance[0, 0, 1, 1] = 9.0
@@ -178,7 +190,9 @@ def test_a_horizon_with_broken_tracks_is_refused() -> None:
         replace(horizon, tracks=tracks_of((0.0, 0.0, 0.0), runs=2)).check()
 
 
-@pytest.mark.parametrize("settings", [{"obstacles": 0}, {"reach_m": 0.0}, {"extra_m": -1.0}])
+@pytest.mark.parametrize(
+    "settings", [{"obstacles": 0}, {"reach_m": 0.0}, {"extra_m": -1.0}, {"extra_sigmas": -1.0}]
+)
 def test_settings_that_mean_nothing_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(ConstraintError, match=next(iter(settings))):
         MovingObstacleContact(**settings)

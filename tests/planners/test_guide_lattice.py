@@ -84,6 +84,42 @@ def seen(shapes: list[Shape], path: PathFrame, covariance: Array) -> Sight:
     return sight
 
 
+@pytest.mark.parametrize("room", [400, 3, 1])
+def test_solids_in_a_window_are_found_without_looking_at_all(room: int) -> None:
+    """Two scenes of 400, one of them with a wall 60 m long; with too little room, those of smallest index."""
+    rng = np.random.default_rng(3)
+    scenes: list[list[Shape]] = [
+        [Sphere(tuple(rng.uniform(-200.0, 200.0, 3)), rng.uniform(0.5, 6.0)) for _ in range(400)]
+        for _ in range(2)
+    ]
+    scenes[1][211] = Box((30.0, 5.0, 0.0), (60.0, 1.0, 4.0))
+    obstacles = ObstacleSet.stack([ObstacleSet.from_shapes(scene) for scene in scenes])
+    path = PathFrame.from_angles((3.0, 2.0, 1.0), 0.4, 0.1)
+    boxes, starts = solid_boxes(obstacles, path), obstacles.scene_start
+    found = np.empty(room, dtype=np.int64)
+    for scene, _ in product(range(2), range(40)):
+        along, left = rng.uniform(-220.0, 220.0, 2)
+        reach = rng.uniform(0.0, 9.0)
+        inside = (
+            (boxes.high[:, 0] >= along - reach) & (boxes.low[:, 0] <= along + 48.0 + reach)
+            & (boxes.high[:, 1] >= left - 30.0 - reach) & (boxes.low[:, 1] <= left + 30.0 + reach)
+        )  # fmt: skip
+        wanted = np.flatnonzero(inside)
+        wanted = wanted[(wanted >= starts[scene]) & (wanted < starts[scene + 1])][:room]
+        count = gather(
+            boxes,
+            starts[scene],
+            starts[scene + 1],
+            along,
+            along + 48.0,
+            left - 30.0,
+            left + 30.0,
+            reach,
+            found,
+        )
+        np.testing.assert_array_equal(found[:count], wanted)
+
+
 def all_missing(sight: Sight, shapes: list[Shape], path: PathFrame, i: int) -> Array:
     """Shortfalls (station, layer, cell) from every solid at every place."""
     boxes = solid_boxes(ObstacleSet.from_shapes(shapes), path)

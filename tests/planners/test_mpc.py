@@ -15,9 +15,7 @@ from napf_mpc.constraints.constraint import Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, TiltLimit
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.navigation.solution import NavSolution
-from napf_mpc.planners.guidance import guidance_covariance
 from napf_mpc.planners.guide import Guide, Passage
-from napf_mpc.planners.guided_field import GuidedNapfPlanner
 from napf_mpc.planners.mpc import QpPlanner, default_constraints
 from napf_mpc.planners.plan import standing_plan
 from napf_mpc.planners.planner import Command, Reason
@@ -436,38 +434,6 @@ def test_a_constraint_of_ones_own_is_kept() -> None:
     np.testing.assert_allclose(command.plan.states[..., -1, 4], -2.0, atol=0.02)
 
 
-@pytest.mark.parametrize("asked", ["held", "expected", "propagated"])
-def test_the_margin_of_a_stage_is_that_of_the_covariance_then(asked: str) -> None:
-    """A flight of 5 s through the filter: 3 sigma 6.5 s ahead grow by 0.3 m if fixes cease."""
-    flown = problem(
-        navigation={"filter": "kalman"}, planner={"kind": "qp", "covariance": asked},
-        mission={"length_m": 12.0}, simulation={"time_limit_s": 5.0},
-    )  # fmt: skip
-    seen: list[Horizon] = []
-
-    class Watch:
-        name = "watch"
-
-        def rows(self, horizon: Horizon) -> LinearRows:
-            seen.append(horizon)
-            return TiltLimit(1.0).rows(horizon)
-
-    planner = QpPlanner(flown, constraints=[*default_constraints(flown), Watch()])
-    simulate(flown, planner, seed=101, runs=2)
-    sigma = np.sqrt(np.array([np.einsum("...ii->...i", horizon.covariance) for horizon in seen[10:]]))
-    grown = 3.0 * (sigma - sigma[:, :, :, :1])
-    assert sigma.shape[1:] == (2, 4, 20, 3)
-    assert (np.diff(sigma, axis=3) >= -1e-3).all() == (asked != "expected")
-    if asked == "held":
-        np.testing.assert_array_equal(grown, 0.0)
-    elif asked == "expected":
-        # The filter's first five seconds: each fix makes it more certain.
-        assert grown[..., -1, :].min() < -0.5
-        assert grown.max() < 0.3
-    else:
-        assert 0.2 < np.median(grown[..., -1, :]) < 0.5
-
-
 def test_unfiltered_covariance_is_held_whatever_is_asked() -> None:
     """No law says how a reported sigma goes on."""
     programs = []
@@ -479,109 +445,6 @@ def test_unfiltered_covariance_is_held_whatever_is_asked() -> None:
         for one, other in zip(programs[0].rows, changed.rows, strict=True):
             np.testing.assert_array_equal(one.jac, other.jac)
             np.testing.assert_array_equal(one.lower, other.lower)
-
-
-@pytest.mark.parametrize("kind", ["qp", "napf_guided"])
-@pytest.mark.parametrize("asked", ["held", "expected", "propagated"])
-def test_guidance_leaves_room_for_the_sigma_that_is_expected_at_the_end_of_the_horizon(
-    kind: str, asked: str
-) -> None:
-    """The filter's first half second: of its variance three quarters are to be left 6.5 s later."""
-    flown = problem(
-        navigation={"filter": "kalman"}, planner={"kind": kind, "covariance": asked},
-        mission={"length_m": 12.0}, simulation={"time_limit_s": 0.5},
-    )  # fmt: skip
-    planner = QpPlanner(flown) if kind == "qp" else GuidedNapfPlanner(flown)
-    guidance = planner._guidance if isinstance(planner, QpPlanner) else planner.guidance
-    assert guidance is not None
-    room: list[np.ndarray] = []
-    now: list[np.ndarray] = []
-    step, fly = guidance.step, planner.step
-
-    def watch(position: np.ndarray, covariance: np.ndarray, *others: object, **named: object) -> Guide:
-        room.append(covariance)
-        return step(position, covariance, *others, **named)  # type: ignore[arg-type]
-
-    def watched(solution: NavSolution, time_s: float) -> Command:
-        now.append(solution.position_covariance.copy())
-        return fly(solution, time_s)
-
-    guidance.step = watch  # type: ignore[method-assign, assignment]
-    planner.step = watched  # type: ignore[method-assign]
-    simulate(flown, planner, seed=101, runs=2)
-    share = np.einsum("truaa->tru", np.array(room)) / np.einsum("truaa->tru", np.array(now))
-    if asked == "expected":
-        np.testing.assert_allclose(share, 0.76, atol=0.02)
-    else:
-        np.testing.assert_allclose(share, 1.0, rtol=1e-9)
-
-
-def test_in_an_outage_guidance_leaves_room_for_the_sigma_now() -> None:
-    """What is expected then is what no fix ever leads to, and one refused fix is no reason for a detour."""
-    seen = []
-
-    class Watch:
-        name = "watch"
-
-        def rows(self, horizon: Horizon) -> LinearRows:
-            seen.append(horizon)
-            return TiltLimit(1.0).rows(horizon)
-
-    flown = problem(
-        navigation={"filter": "kalman"}, planner={"kind": "qp"}, mission={"length_m": 12.0},
-        simulation={"time_limit_s": 0.3},
-    )  # fmt: skip
-    planner = QpPlanner(flown, constraints=[*default_constraints(flown), Watch()])
-    given: list[NavSolution] = []
-    fly = planner.step
-
-    def watched(solution: NavSolution, time_s: float) -> Command:
-        given.append(solution)
-        return fly(solution, time_s)
-
-    planner.step = watched  # type: ignore[method-assign]
-    simulate(flown, planner, seed=101, runs=2)
-    solution = given[-1]
-    assert solution.forecast is not None
-    everybody = solution.trusted()
-    ahead = 0.5 * solution.position_covariance
-    used = np.zeros_like(everybody)
-    used[0] = True
-    lost = replace(solution, forecast=replace(solution.forecast, fixes=used))
-    room = guidance_covariance(lost, everybody, ahead, "expected")
-    np.testing.assert_array_equal(room[0], ahead[0])
-    np.testing.assert_array_equal(room[1], solution.position_covariance[1])
-    nobody = np.zeros_like(everybody)
-    np.testing.assert_array_equal(guidance_covariance(lost, nobody, ahead, "expected")[0, 0], np.eye(3))
-
-
-@pytest.mark.parametrize("share", [0.5, 0.9, 1.0])
-@pytest.mark.parametrize("asked", ["held", "expected", "propagated"])
-def test_a_shared_error_makes_no_relative_position_more_certain_than_it_is(share: float, asked: str) -> None:
-    """Along the horizon the shared part shrinks with the whole: what is left of two UAVs is a covariance."""
-    flown = problem(
-        navigation={"filter": "kalman", "common_mode_share": share},
-        planner={"kind": "qp", "covariance": asked},
-        mission={"length_m": 12.0}, simulation={"time_limit_s": 4.0},
-    )  # fmt: skip
-    least, now = [], []
-
-    class Watch:
-        name = "watch"
-
-        def rows(self, horizon: Horizon) -> LinearRows:
-            factor = horizon.common_factor
-            assert factor.any()
-            cross = factor[:, 0] @ factor[:, 1].transpose(0, 2, 1)
-            both = horizon.covariance[:, 0] + horizon.covariance[:, 1]
-            relative = both - (cross + cross.transpose(0, 2, 1))[:, None]
-            least.append(np.linalg.eigvalsh(relative).min())
-            now.append(np.linalg.eigvalsh(both).max())
-            return TiltLimit(1.0).rows(horizon)
-
-    simulate(flown, QpPlanner(flown, constraints=[*default_constraints(flown), Watch()]), seed=101, runs=2)
-    assert len(least) == 40
-    assert (np.array(least) >= -1e-9 * np.array(now)).all()
 
 
 def test_rows_that_do_not_fit_are_an_error_and_not_a_fall_back() -> None:

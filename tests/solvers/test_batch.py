@@ -155,10 +155,8 @@ def test_plan_obeys_the_model_and_slacks_are_the_gaps_in_metres() -> None:
 @pytest.mark.parametrize("pull_m", [0.5, 2.0, 10.0])
 def test_one_feasible_soft_row_is_kept_to_a_micrometre(name: str, pull_m: float) -> None:
     """The references lie beyond a wall; its price is above what the wall pushes with, so nothing leaks."""
-    try:
-        solver = make_batch_solver(name)
-    except SolverError:
-        pytest.skip(f"{name} is not installed")
+    pytest.importorskip(name)
+    solver = make_batch_solver(name)
     initial = np.zeros((1, 1, 12))
     reference = np.zeros((1, 1, STAGES, 12))
     reference[..., 0] = pull_m
@@ -208,10 +206,8 @@ def bits(result: BatchResult) -> list[Array]:
 @pytest.mark.parametrize("name", ["osqp", "piqp"])
 def test_batch_is_one_by_one_bit_for_bit(name: str) -> None:
     """Three steps with warm starts, so that kept workspaces are part of it."""
-    try:
-        together = make_batch_solver(name)
-    except SolverError:
-        pytest.skip(f"{name} is not installed")
+    pytest.importorskip(name)
+    together = make_batch_solver(name)
     alone = {(r, u): make_batch_solver(name) for r in range(5) for u in range(3)}
     warm: WarmStart | None = None
     for seed in (1, 2, 3):
