@@ -148,6 +148,8 @@ class Flight:
     reason: NDArray[np.int8] | None = None
     """(run,) why it waited at the end, codes of :class:`~napf_mpc.planners.planner.Reason`, the largest of
     the run's UAVs; None if it never did."""
+    waited_s: Array | None = None
+    """(run,) time in which some UAV was hovering on purpose [s]; None if none ever was."""
 
 
 def closed_loop(
@@ -183,6 +185,7 @@ def closed_loop(
     failed, lost = np.zeros(runs, dtype=bool), np.zeros(runs, dtype=bool)
     holding = np.zeros(runs, dtype=bool)
     reason = np.zeros(runs, dtype=np.int8)
+    waited_s = np.zeros(runs)
     finish_time = np.full(runs, np.nan)
     duration = np.zeros(runs)
     planner.reset(scenario.obstacles, runs)
@@ -217,6 +220,7 @@ def closed_loop(
             holding[active] = command.holding[active].any(-1)
             if command.reason is not None:
                 reason[active] = command.reason[active].max(-1)
+        waited_s[active & holding] += clock.period_s
         inputs = _inner_loop(law, nav, command, active)
         for observer in observers:
             observer.ticked(time_s, state, nav, command, inputs, active)
@@ -250,6 +254,7 @@ def closed_loop(
         duration,
         None if filtered is None else filtered.gated_fixes,
         reason,
+        waited_s,
     )
 
 

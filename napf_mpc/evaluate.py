@@ -30,6 +30,8 @@ APART_S = 5.0
 """Separation counts from here on: the paper's take-off places are 1.4 m apart."""
 REFORMED_S = 1.0
 """A formation is re-formed once its shape error has stayed under the bound for this long."""
+DELAYED = "out of time after waiting"
+"""Reason of a run that was on its way when time was up, and would have arrived but for its waits."""
 CONSISTENCY_EVERY_S = 0.2
 """How often the filter's errors are compared with its covariance; they change over seconds."""
 
@@ -53,6 +55,7 @@ METRICS = (
     "control_effort",
     "reform_time_s",
     "finish_time_s",
+    "waited_s",
     "min_clearance_m",
     "min_separation_m",
     "within_k_sigma_east",
@@ -82,7 +85,8 @@ class Score:
     finished: NDArray[np.bool_]
     """(run,) every UAV passed the mission's length in time, contacts or not."""
     reason: tuple[str, ...]
-    """(run,) why a run that did not finish waited; empty if it did finish, or did not wait."""
+    """(run,) why a run that did not finish waited, or :data:`DELAYED`; empty if it did finish, or was on its
+    way and had not waited for long."""
     metrics: dict[str, Array]
     """Name -> (run,); NaN where the metric is not defined, such as a finish time without a finish."""
 
@@ -203,6 +207,7 @@ class MissionScore:
         uav = separation < vehicle.min_separation_m
         collided = obstacle.any(-1) | uav
         waited = np.zeros(len(collided), dtype=np.int8) if flight.reason is None else flight.reason
+        waited_s = np.zeros(len(collided)) if flight.waited_s is None else flight.waited_s
         outcome = tuple(
             Outcome.FAILED
             if failed
@@ -232,6 +237,7 @@ class MissionScore:
                 "control_effort": self._sums[:, _EFFORT].copy(),
                 "reform_time_s": self._reform_time.copy(),
                 "finish_time_s": flight.finish_time_s.copy(),
+                "waited_s": waited_s.copy(),
                 "min_clearance_m": _finite_or_nan(clearance.min(-1) - vehicle.radius_m),
                 "min_separation_m": _finite_or_nan(separation),
                 "within_k_sigma_east": self._sums[:, _WITHIN] / self._sums[:, _FIXES],
@@ -252,11 +258,17 @@ class MissionScore:
             flight.reached & ~collided & ~flight.failed & reformed,
             flight.reached & ~flight.failed,
             tuple(
-                "" if done else REASON_WORDS[Reason(r)]
-                for done, r in zip(flight.reached, waited, strict=True)
+                "" if done else DELAYED if late and r == Reason.NONE else REASON_WORDS[Reason(r)]
+                for done, r, late in zip(flight.reached, waited, self._delayed(waited_s), strict=True)
             ),
             metrics,
         )
+
+    def _delayed(self, waited_s: Array) -> Mask:
+        """Whether the waits (run,) were longer than what was left of the path takes at reference speed."""
+        mission = formation_mission(self._problem)
+        left_m = mission.length_m - self._end.min(-1)
+        return np.asarray(waited_s * mission.speed_mps >= left_m)
 
 
 def _seen_from_path(solids: Solids, frame: PathFrame) -> tuple[Array, Array]:

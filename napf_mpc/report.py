@@ -23,6 +23,7 @@ METRIC_LABELS = {
     "control_effort": "control effort [N² s]",
     "reform_time_s": "time to re-form [s]",
     "finish_time_s": "finish time [s]",
+    "waited_s": "time waited [s]",
     "min_clearance_m": "least clearance [m]",
     "min_separation_m": "least separation [m]",
     "within_k_sigma_east": "share of errors within k sigma: east",

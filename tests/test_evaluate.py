@@ -10,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from napf_mpc.closed_loop import POSITION, Flight, build_scenario, formation_mission
-from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
+from napf_mpc.evaluate import DELAYED, METRICS, MissionScore, Outcome, Score
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.planner import REASON_WORDS, Reason
 from napf_mpc.problem import Problem
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
@@ -424,6 +425,33 @@ def test_outcomes_are_decided_in_their_order(
         assert all(np.isnan(score.metrics[name]).all() for name in METRICS)
     else:
         assert np.isnan(metric(score, "finish_time_s")) == (not reached)
+
+
+@pytest.mark.parametrize(
+    ("waited_s", "reason", "words"),
+    [
+        (38.1, Reason.NONE, ""),
+        (38.3, Reason.NONE, DELAYED),
+        (38.3, Reason.WAITING, REASON_WORDS[Reason.WAITING]),
+    ],
+)
+def test_a_late_run_that_would_have_arrived_but_for_its_waits_says_so(
+    waited_s: float, reason: Reason, words: str
+) -> None:
+    """After 15 s at 2 m/s the last UAV, 6.4 m behind the middle, has 76.4 m left: 38.2 s."""
+    score = judged(
+        lambda _: np.zeros((4, 3)),
+        until_s=15.0,
+        flight={
+            "reached": np.array([False]),
+            "finish_time_s": np.array([np.nan]),
+            "waited_s": np.array([waited_s]),
+            "reason": np.array([reason], dtype=np.int8),
+        },
+    )
+    assert score.outcome == (Outcome.TIMEOUT,)
+    assert score.reason == (words,)
+    assert metric(score, "waited_s") == waited_s
 
 
 def test_runs_that_are_over_are_not_judged_further() -> None:
