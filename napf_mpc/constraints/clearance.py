@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows, along_rows
+from napf_mpc.constraints.passage import margins_beside, passage_margins
 from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins, sigma_along
 from napf_mpc.jit import compiled
 from napf_mpc.safety_distance import Inflation
@@ -28,7 +29,7 @@ from napf_mpc.world.distance import CYLINDER, SPHERE, A
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-Margin = Literal["half_space", "exact"]
+Margin = Literal["half_space", "exact", "passage"]
 
 CONTACT_W1 = 1000.0
 """Linear price of a contact slack [1/(m s)].
@@ -53,7 +54,7 @@ class Gaps:
     normal: Array
     """(run, uav, N, M, 3) unit gradient of the distance; zero without."""
     margin: Array
-    """(run, uav, N, M) k sigma, or the exact margin of a sphere or cylinder [m]."""
+    """(run, uav, N, M) k sigma, or the margin of a sphere or cylinder [m]."""
     sigma: Array
     """(run, uav, N, M) standard deviation of the position as the inflation reads it [m]."""
     shifted: Array
@@ -77,8 +78,9 @@ class Gaps:
             M.
         reach_m : float
             Obstacles with a shifted distance of this or more count as none [m].
-        margin : "half_space" or "exact"
-            Margin against a flat wall, or against the sphere or cylinder that is there.
+        margin : "half_space", "exact" or "passage"
+            Margin against a flat wall, or against the sphere or cylinder that is there, see
+            :class:`ObstacleContact`.
         """
         runs, uavs, stages = horizon.shape
         radius, rho_0 = horizon.problem.vehicle.radius_m, horizon.problem.planner.influence_m
@@ -93,7 +95,10 @@ class Gaps:
         shape, points = (runs, uavs, stages, 2 * count), runs * uavs * stages
         normal, index = near.gradient.reshape(*shape, 3), near.index.reshape(shape)
         sigma = _sigma(horizon.covariance, normal, inflation)
-        size = _exact(horizon, index, normal, inflation) if margin == "exact" else inflation.k * sigma
+        if margin == "half_space":
+            size = inflation.k * sigma
+        else:
+            size = (_exact if margin == "exact" else _passage)(horizon, index, normal, inflation)
         kept = (runs, uavs, stages, count)
         gaps = cls(np.empty(kept), np.empty((*kept, 3)), *[np.empty(kept) for _ in range(4)])
         _choose(
@@ -245,6 +250,24 @@ def _exact(horizon: Horizon, index: Index, normal: Array, inflation: Inflation) 
     return margin
 
 
+def _passage(horizon: Horizon, index: Index, normal: Array, inflation: Inflation) -> Array:
+    """Margins (run, uav, N, m) of a passage beside the spheres that are there."""
+    world, margin = horizon.obstacles, np.empty(index.shape)
+    points, m = index[..., 0].size, index.shape[-1]
+    margins_beside(
+        passage_margins(inflation),
+        world.solids,
+        world.scene_start[:-1],
+        index.shape[0],
+        np.ascontiguousarray(index).reshape(points, m),
+        plain(normal).reshape(points, m, 3),
+        plain(inflation.margin_covariance(horizon.covariance)).reshape(points, 3, 3),
+        horizon.problem.vehicle.radius_m,
+        margin.reshape(points, m),
+    )
+    return margin
+
+
 def _mission(inflation: Inflation) -> tuple[float, float, float, float]:
     """Risk, active time, correlation time and period of the budget that k comes from; no risk without."""
     budget = inflation.budget
@@ -265,7 +288,8 @@ class _Shell:
     """``half_space`` is exact for a wall and careful elsewhere; ``exact`` asks for the same chance of a hit
     of the sphere or cylinder itself: at each time and obstacle, or, with ``planner.risk_per_mission``, in a
     mission. Small obstacles then take less room, and use up the whole of what is asked: bound the mission's
-    risk with it, not the step's."""
+    risk with it, not the step's. ``passage`` asks for the same chance while the UAV passes a sphere, see
+    :mod:`.passage`; all else is a wall to it."""
 
     def __post_init__(self) -> None:
         if self.obstacles < 1 or not self.reach_m > 0.0:

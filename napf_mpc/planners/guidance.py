@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.constraints.passage import PassageMargins, half_space_margins
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets, synchronisation_error
 from napf_mpc.navigation.solution import NavSolution
@@ -62,10 +63,16 @@ class Guidance:
         Its k and its reading of sigma; guidance always takes k sigma as distance.
     settings : GuidanceSettings, optional
         Weights and limits.
+    margins : PassageMargins, optional
+        Sigmas to keep from spheres and cylinders, by default k.
     """
 
     def __init__(
-        self, problem: Problem, inflation: Inflation, settings: GuidanceSettings | None = None
+        self,
+        problem: Problem,
+        inflation: Inflation,
+        settings: GuidanceSettings | None = None,
+        margins: PassageMargins | None = None,
     ) -> None:
         if not isinstance(problem.mission, FormationMission):
             raise ProblemError("mission.kind", ['must be "formation" for guidance, not "goal"'])
@@ -81,7 +88,9 @@ class Guidance:
         self._traffic = TrafficPace(
             self._path, problem.mission.speed_mps, problem.vehicle.radius_m, inflation
         )
-        self._search = search_of(self.settings, inflation.k, problem.vehicle.radius_m)
+        if margins is None:
+            margins = half_space_margins(inflation.k)
+        self._search = search_of(self.settings, margins, problem.vehicle.radius_m)
         stations = (self._search.lattice.stations - 1) * FINE + 1
         self._step_m = self._search.lattice.step_m / FINE
         self.ahead_m: Array = self._step_m * np.arange(stations, dtype=np.float64)

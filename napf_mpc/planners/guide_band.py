@@ -21,6 +21,7 @@ from napf_mpc.planners.guide_clearance import (
     OUTER2,
     RADIUS,
     ROUND,
+    SIGMAS,
     TOUCHED,
     UP,
     Sight,
@@ -196,7 +197,7 @@ def take_solids(
     own, right = band.own, band.right
     near, found = sight.near, sight.found
     solids, frame, turned, covariance = sight.solids, sight.frame, sight.turned[i], sight.covariance[i]
-    k, need = sight.k, sight.need_m
+    k, need = sight.margins.k, sight.need_m
     lane, height, start = sight.lanes[i, 0], sight.lanes[i, 1], sight.along[i]
     stations = profile.shape[0]
     lowest = highest = profile[0, 0]
@@ -226,7 +227,14 @@ def take_solids(
                 continue
             if is_round(near, i, entry, up):
                 short, g0, g1 = round_shortfall(
-                    x, y, z, near[i, entry, RADIUS], near[i, entry, TOUCHED], turned, k, need
+                    x,
+                    y,
+                    z,
+                    near[i, entry, RADIUS],
+                    near[i, entry, TOUCHED],
+                    turned,
+                    near[i, entry, SIGMAS],
+                    need,
                 )
             else:
                 short, g0, g1 = shortfall(

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.constraints.passage import PassageMargins, sigmas_beside, volume
 from napf_mpc.formation import PathFrame
 from napf_mpc.jit import compiled
 from napf_mpc.world.distance import BASE, CYLINDER, SPHERE, TOP, TOUCH_M, A, Solids, X, Y, signed_distance
@@ -69,7 +70,9 @@ BOTTOM, LID = 12, 13
 """Base and top of a cylinder in the path's frame."""
 TOUCHED = 14
 """Variance in the direction that counts as the gradient at the centre or on the axis [m^2]."""
-COLUMNS = 15
+SIGMAS = 15
+"""How many sigmas to keep from what is round."""
+COLUMNS = 16
 
 
 class Sight(NamedTuple):
@@ -77,7 +80,8 @@ class Sight(NamedTuple):
 
     solids: Solids
     frame: Frame
-    k: float
+    margins: PassageMargins  # sigmas to keep from each solid
+    radius_m: float
     need_m: float  # radius and spare
     along: Array  # (uav,)
     lanes: Array  # (uav, 2)
@@ -152,6 +156,9 @@ def look(sight: Sight, boxes: SolidBoxes, i: int) -> None:
             row[RADIUS] = given[A]
             row[TOUCHED] = c[2, 2] if kind == SPHERE else c[0, 0]
             row[OUTER2] = (given[A] + reach) ** 2
+            row[SIGMAS] = sight.margins.k
+            if kind == SPHERE:
+                row[SIGMAS] = sphere_sigmas(sight.margins, given[A] + sight.radius_m, c)
             x = given[X] - sight.frame.origin[0]
             y = given[Y] - sight.frame.origin[1]
             z = given[BASE] - sight.frame.origin[2]
@@ -161,6 +168,13 @@ def look(sight: Sight, boxes: SolidBoxes, i: int) -> None:
                 z = 0.0
             for a in range(3 if kind == SPHERE else 2):
                 row[a] = x * ax[a, 0] + y * ax[a, 1] + z * ax[a, 2]
+
+
+@compiled
+def sphere_sigmas(margins: PassageMargins, radius: float, covariance: Array) -> float:
+    """Sigmas to keep from a sphere: as with an error of the same volume, equal in all directions."""
+    sigma = volume(covariance) ** (1.0 / 3.0)
+    return sigmas_beside(margins, radius, sigma, sigma * sigma)
 
 
 @compiled

@@ -25,6 +25,7 @@ from napf_mpc.planners.guide_clearance import (
     OUTER2,
     RADIUS,
     ROUND,
+    SIGMAS,
     TOUCHED,
     UP,
     Sight,
@@ -173,7 +174,7 @@ def cover(
     near, found, here, turned = sight.near, sight.found, sight.here, sight.turned
     missing, known = sight.missing, sight.known
     solids, frame, covariance = sight.solids, sight.frame, sight.covariance
-    k, need = sight.k, sight.need_m
+    k, need = sight.margins.k, sight.need_m
     here_count = sight.here_count[i, s]
     lane = sight.lanes[i, 0]
     height = sight.lanes[i, 1]
@@ -227,7 +228,7 @@ def cover(
                     if a <= z1:
                         _fill_round(
                             missing, i, s, v, a, z1, y0, cell, x, z, near[i, entry, RADIUS],
-                            near[i, entry, TOUCHED], turned, k, need,
+                            near[i, entry, TOUCHED], turned, near[i, entry, SIGMAS], need,
                         )  # fmt: skip
                 continue
             for c in range(c0, c1 + 1):

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.constraints.passage import PassageMargins
 from napf_mpc.jit import compiled
 from napf_mpc.planners.guide_band import (
     Band,
@@ -69,7 +70,7 @@ class Search(NamedTuple):
     wide_m: float  # radius and margin from which that is used
     prices: Prices
     wide_prices: Prices  # of the coarser lattice
-    k: float
+    margins: PassageMargins  # sigmas to keep
     radius_m: float
     passes: int
     pass_m: float  # largest step of a pass [m]
@@ -250,7 +251,7 @@ def plan_run(
     need = search.radius_m + prices.spare_m
     lattice = search.lattice
     for i in range(uavs):
-        if largest_reach(covariance[i], search.k, need) > search.wide_m:
+        if largest_reach(covariance[i], search.margins.k, need) > search.wide_m:
             lattice = search.wide
             prices = search.wide_prices
     step = lattice.step_m / lattice.fine
@@ -260,7 +261,7 @@ def plan_run(
     upwards = False
     downwards = True
     for i in range(uavs):
-        reach[i] = largest_reach(covariance[i], search.k, need)
+        reach[i] = largest_reach(covariance[i], search.margins.k, need)
         count[i] = gather(
             boxes, first, stop, along[i] - 1.0, along[i] + ahead, lanes[i, 0] - span, lanes[i, 0] + span,
             reach[i], found[i],
@@ -277,8 +278,8 @@ def plan_run(
         layers += 2 * below if downwards else lattice.layers
     mean = np.empty((fine, 2))
     sight = Sight(
-        solids, frame, search.k, need, along, lanes, covariance, scratch.turned, reach, found, count,
-        scratch.near, scratch.here, scratch.here_count, scratch.missing, scratch.known,
+        solids, frame, search.margins, search.radius_m, need, along, lanes, covariance, scratch.turned, reach,
+        found, count, scratch.near, scratch.here, scratch.here_count, scratch.missing, scratch.known,
     )  # fmt: skip
     in_the_way = 0
     moved = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from napf_mpc.constraints.passage import PassageMargins
 from napf_mpc.planners.guide_lattice import Lattice, Prices
 from napf_mpc.planners.guide_search import Search
 
@@ -149,15 +150,15 @@ def _prices(settings: GuidanceSettings, scale: int) -> Prices:
     return Prices(*map(float, prices))
 
 
-def search_of(settings: GuidanceSettings, k: float, radius_m: float) -> Search:
-    """Settings in the form that the compiled search reads, for a margin of k sigma and a radius [m]."""
+def search_of(settings: GuidanceSettings, margins: PassageMargins, radius_m: float) -> Search:
+    """Settings in the form that the compiled search reads, for margins and a radius [m]."""
     return Search(
         _lattice(settings, 1),
         _lattice(settings, 2),
         settings.wide_m,
         _prices(settings, 1),
         _prices(settings, 2),
-        k,
+        margins,
         radius_m,
         settings.passes,
         settings.pass_m,

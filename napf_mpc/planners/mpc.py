@@ -14,6 +14,7 @@ from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, InputBox, SpeedLimit, TiltLimit
 from napf_mpc.constraints.moving import MovingObstacleContact
 from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
+from napf_mpc.constraints.passage import passage_margins
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.jit import compiled
@@ -70,9 +71,12 @@ def default_constraints(problem: Problem) -> list[Constraint]:
         extra_m=settings.contact_extra_m,
         extra_sigmas=settings.contact_extra_sigmas,
         opening_mps=LEAVING_MPS,
+        margin=settings.margin,
     )
     most = REPULSION_PART * price if price > 0.0 else math.inf
-    influence = ObstacleInfluence(obstacles=rows, per_speed=settings.influence_scale, most=most)
+    influence = ObstacleInfluence(
+        obstacles=rows, per_speed=settings.influence_scale, most=most, margin=settings.margin
+    )
     neighbours = min(NEIGHBOURS, problem.uav_count - 1)
     apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
     others: list[Constraint] = [apart] if neighbours else []
@@ -144,7 +148,8 @@ class QpPlanner:
         self._slots = SlotReference.of_problem(problem, problem.mission)
         follows = settings.guidance == "blended" if guided is None else guided
         self._inflation = Inflation.of_problem(problem)
-        self._guidance = Guidance(problem, self._inflation) if follows else None
+        margins = passage_margins(self._inflation) if settings.margin == "passage" else None
+        self._guidance = Guidance(problem, self._inflation, margins=margins) if follows else None
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
         self._period_s = 1.0 / settings.rate_hz
         step = stage_grid(self._period_s, settings.horizon, settings.look_ahead_s)
@@ -286,19 +291,32 @@ class QpPlanner:
         place, times = state[..., POSITION], self._model.times_s
         sigma = self._to_be_corrected(nav, trusted, covariance)
         share: Array | float = self.problem.planner.cohesion
+        # An estimate's jumps are those that the filter corrects: small beside what bends a shape.
+        doubt: Array | float = 0.0 if nav.filtered else sigma[..., 1:]
         if guide is None:
             free = reference = way = self._slots.over(place, times, sigma)
         else:
             way = self._slots.over(place, times, sigma, guide)
             if guide.taut is None:
-                return way, way
+                return self._together(way, way, carried, trusted, share, doubt), way
             free = self._slots.over(place, times, sigma, guide.on_lanes())
             reference = self._slots.over(place, times, sigma, guide.pulled())
             along = self._frame.along_track
             share = share * guide.loose_at(along(free[..., POSITION]) - along(place)[..., None])
-        if carried is not None and len(self._lanes) > 1:
-            reference = drawn_together(reference, free, carried[0], trusted, share, self._frame)
-        return reference, way
+        return self._together(reference, free, carried, trusted, share, doubt), way
+
+    def _together(
+        self,
+        reference: Array,
+        free: Array,
+        carried: tuple[Array, Array] | None,
+        trusted: Mask,
+        share: Array | float,
+        sigma_m: Array | float,
+    ) -> Array:
+        if carried is None or len(self._lanes) == 1:
+            return reference
+        return drawn_together(reference, free, carried[0], trusted, share, self._frame, sigma_m)
 
     def _guess(
         self, state: Array, way: Array, carried: tuple[Array, Array] | None, time_s: float

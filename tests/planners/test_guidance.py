@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from napf_mpc.block import simulate
+from napf_mpc.constraints.passage import passage_margins
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guidance import Guidance
@@ -124,6 +125,28 @@ def test_head_on_it_goes_round_one_side_with_its_margin_and_comes_back(shape: Sh
     assert reasons(guides) == {Passage.NONE, Passage.DETOUR}
     # No farther than it needs: radius, k sigma, spare and some for the solid's own size.
     assert max(np.abs(place[0, 1:] - SLOTS[0, 1:]).max() for place in places) < 1.5 + RADIUS + K_SIGMA + 1.0
+
+
+def test_margins_of_a_passage_let_it_pass_nearer_to_what_is_small_and_round() -> None:
+    """An error of 2 m: three quarters of a wall's margin from a small ball, all of it from a post or box."""
+    table = passage_margins(Inflation(3.0))
+    shapes: list[Shape] = [
+        Sphere((40.0, 3.0, 0.0), 0.5),
+        Cylinder((40.0, 3.0), 0.5),
+        Box((40.0, 3.0, 0.0), (1.0, 1.0, 90.0)),
+    ]
+    part = []
+    for shape in shapes:
+        farthest = []
+        for margins in (None, table):
+            made = Guidance(problem(), Inflation(3.0), margins=margins)
+            made.reset(ObstacleSet.from_shapes([shape]), 1)
+            guide = made.step(advanced(8.0)[None], isotropic(2.0), np.ones((1, 4), dtype=bool), 0.0)
+            assert guide.breach_m.max() < SETTINGS.tolerance_m
+            farthest.append(float(np.hypot(*guide.offset[0, 0].T).max()))
+        part.append(farthest[1] / farthest[0])
+    assert 0.65 < part[0] < 0.85
+    assert part[1] == part[2] == 1.0
 
 
 def test_one_obstacle_moves_one_uav_and_not_the_formation() -> None:

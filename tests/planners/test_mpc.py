@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from napf_mpc.block import simulate
-from napf_mpc.constraints.clearance import ObstacleInfluence
+from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, TiltLimit
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.guide import Guide, Passage
+from napf_mpc.planners.guide_clearance import sphere_sigmas
 from napf_mpc.planners.mpc import QpPlanner, default_constraints
 from napf_mpc.planners.plan import standing_plan
 from napf_mpc.planners.planner import Command, Reason
@@ -239,6 +240,24 @@ def test_a_height_band_is_rows_of_the_program_and_none_by_default() -> None:
 
     assert bands(problem()) == []
     assert bands(problem(planner={"kind": "qp", "altitude_m": (-2.0, 3.5)})) == [(-2.0, 3.5)]
+
+
+@pytest.mark.parametrize(("margin", "share"), [("half_space", 1.0), ("passage", 0.79)])
+def test_rows_and_guidance_keep_the_margin_that_the_problem_asks_for(margin: str, share: float) -> None:
+    """A ball of 2 m and an error of 5 m: four fifths of a wall's margin for the one, all for the other."""
+    asked = problem(planner={"kind": "qp", "k": 3.0, "margin": margin, "contact_extra_m": 0.0})
+    made = default_constraints(asked)
+    shells = [each for each in made if isinstance(each, (ObstacleContact, ObstacleInfluence))]
+    assert [shell.margin for shell in shells] == [margin, margin]
+    planner = QpPlanner(asked)
+    planner.reset(ObstacleSet.from_shapes([Sphere((30.0, 3.0, 0.0), 2.0)]), 1)
+    planner.step(nav(on_slots(planner), sigma_m=5.0), 0.0)
+    assert planner._last_horizon is not None
+    gaps = shells[0].gaps(planner._last_horizon)
+    assert np.median(gaps.margin[np.isfinite(gaps.distance)]) == pytest.approx(15.0 * share, abs=0.3)
+    assert planner._guidance is not None
+    sigmas = sphere_sigmas(planner._guidance._search.margins, 2.3, 25.0 * np.eye(3))
+    assert 5.0 * sigmas == pytest.approx(15.0 * share, abs=0.3)
 
 
 # ------------------------------------------------------------------------------------ plans that stand
