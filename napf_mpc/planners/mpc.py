@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
+from napf_mpc.constraints.clearance import Margin, ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, InputBox, SpeedLimit, TiltLimit
 from napf_mpc.constraints.moving import MovingObstacleContact
@@ -61,21 +61,33 @@ _CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
 _WORDS = np.array([status.value for status in STATUSES])
 
 
+def margin_of(problem: Problem) -> Margin:
+    """Margin beside spheres that a problem asks for.
+
+    Errors of measurements are metres and come and go, and a wall's margin then is far more than a ball needs.
+    Behind a filter there is little to gain, and what is left on top of the margin there counts on it.
+    """
+    asked = problem.planner.margin
+    if asked == "auto":
+        return "passage" if problem.navigation.filter == "none" else "half_space"
+    return asked
+
+
 def default_constraints(problem: Problem) -> list[Constraint]:
     """Rows of the QP as a problem's settings ask for them."""
     settings = problem.planner
-    rows, price = settings.obstacle_rows, settings.contact_price
+    rows, price, margin = settings.obstacle_rows, settings.contact_price, margin_of(problem)
     contact = ObstacleContact(
         obstacles=rows,
         w1=price,
         extra_m=settings.contact_extra_m,
         extra_sigmas=settings.contact_extra_sigmas,
         opening_mps=LEAVING_MPS,
-        margin=settings.margin,
+        margin=margin,
     )
     most = REPULSION_PART * price if price > 0.0 else math.inf
     influence = ObstacleInfluence(
-        obstacles=rows, per_speed=settings.influence_scale, most=most, margin=settings.margin
+        obstacles=rows, per_speed=settings.influence_scale, most=most, margin=margin
     )
     neighbours = min(NEIGHBOURS, problem.uav_count - 1)
     apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
@@ -148,7 +160,7 @@ class QpPlanner:
         self._slots = SlotReference.of_problem(problem, problem.mission)
         follows = settings.guidance == "blended" if guided is None else guided
         self._inflation = Inflation.of_problem(problem)
-        margins = passage_margins(self._inflation) if settings.margin == "passage" else None
+        margins = passage_margins(self._inflation) if margin_of(problem) == "passage" else None
         self._guidance = Guidance(problem, self._inflation, margins=margins) if follows else None
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
         self._period_s = 1.0 / settings.rate_hz
