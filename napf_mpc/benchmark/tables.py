@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 PACKAGES = (
     "napf-mpc", "numpy", "scipy", "numba", "osqp", "qpsolvers", "piqp", "proxsuite", "daqp", "clarabel",
-    "highspy", "cvxpy",
+    "highspy", "cvxpy", "casadi",
 )  # fmt: skip
 """Packages whose versions decide the times."""
 
