@@ -70,7 +70,7 @@ def test_a_plan_flies_as_the_plant_does() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_rows_are_kept_from_a_guess_and_from_nothing(seed: int) -> None:
+def test_rows_are_kept_from_a_guess_and_from_nothing(seed: int, capfd: pytest.CaptureFixture[str]) -> None:
     horizon = mixed(seed, runs=1, uavs=1)
     program = NonlinearProgram(VEHICLE, horizon)
     for guess in (None, linear(horizon)):
@@ -78,6 +78,24 @@ def test_rows_are_kept_from_a_guess_and_from_nothing(seed: int) -> None:
         assert answer.solved, answer.words
         assert program.violation(horizon, answer.z) < 0.05
     assert program.violation(horizon, np.full(len(answer.z), np.nan)) == np.inf
+    assert capfd.readouterr() == ("", ""), "IPOPT keeps quiet"
+
+
+class Stopped:
+    """Stands for IPOPT after Ctrl-C."""
+
+    def __call__(self, **given: object) -> dict[str, Array]:
+        return {"x": np.zeros(3)}
+
+    def stats(self) -> dict[str, object]:
+        return {"success": False, "return_status": "User_Requested_Stop", "iter_count": 1}
+
+
+def test_an_interrupt_taken_by_ipopt_is_handed_on() -> None:
+    program = NonlinearProgram(VEHICLE, gentle(1.0))
+    program._cold_solver = Stopped()
+    with pytest.raises(KeyboardInterrupt):
+        program.solve(gentle(1.0), None)
 
 
 def test_all_contenders_see_the_same_programs_and_claims_are_counted() -> None:

@@ -1,8 +1,8 @@
 """Nonlinear MPC: the planner's programs with the quadrotor as it is instead of its linearisation at hover.
 
 Everything but the dynamics stays: stages, references, weights, rows with their slacks and prices. The states
-at the ends of the stages are variables (multiple shooting) that Runge-Kutta steps of the nonlinear model join,
-and IPOPT solves it.
+at the ends of the stages are variables (multiple shooting) that Runge-Kutta steps of the nonlinear model
+join, and IPOPT solves it.
 
 A. Waechter, L. T. Biegler, "On the implementation of an interior-point filter line-search algorithm for
 large-scale nonlinear programming", Mathematical Programming 106, 2006.
@@ -116,6 +116,11 @@ class NonlinearProgram:
         -------
         NonlinearAnswer
             Whatever IPOPT makes of it.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            Also when IPOPT took the interrupt for itself.
         """
         numbers, lower, upper = self._numbers(horizon)
         bounds = {"p": numbers, "lbg": lower, "ubg": upper}
@@ -130,6 +135,9 @@ class NonlinearProgram:
             solver, guess = self._cold_solver, {"x0": z}
         said = solver(**bounds, **guess)
         stats, z = solver.stats(), np.array(said["x"], dtype=float).ravel()
+        if stats["return_status"] == "User_Requested_Stop":
+            # Nobody else stops it: CasADi has told IPOPT of an interrupt and keeps it to itself.
+            raise KeyboardInterrupt
         return NonlinearAnswer(
             bool(stats["success"]), str(stats["return_status"]), z, int(stats["iter_count"])
         )

@@ -23,7 +23,7 @@ from napf_mpc.qp import Array, HorizonQp, Layout
 from napf_mpc.solvers.batch import make_batch_solver
 
 KERNEL = "kernel"
-NONLINEAR, NONLINEAR_COLD = "nonlinear, IPOPT, warm", "nonlinear, IPOPT, cold"
+NONLINEAR, NONLINEAR_COLD = "nonlinear, warm", "nonlinear, cold"
 """Labels: from the flight's own last answer, and from hover where the UAV is."""
 
 

@@ -117,11 +117,11 @@ def benchmark_nonlinear(
     paths: dict[Path, None] = {}
     for label, scene in scenes.items():
         rows += measure_nonlinear(label, scene, missions=missions, every=every, seed=seed)
-        shown = nonlinear_tables(nonlinear_summaries(rows), flights)
         tell(f"{label}: {len({row.step for row in rows if row.scene == label})} steps timed")
         if out is not None:
-            paths |= dict.fromkeys(write(out, "nonlinear", rows, shown))
-    return shown, list(paths)
+            wide = nonlinear_tables(nonlinear_summaries(rows), flights, wide=True)
+            paths |= dict.fromkeys(write(out, "nonlinear", rows, wide))
+    return nonlinear_tables(nonlinear_summaries(rows), flights, wide=False), list(paths)
 
 
 def benchmark_planners(
