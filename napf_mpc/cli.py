@@ -263,10 +263,11 @@ app.add_typer(benchmark, name="benchmark")
 def of_what(context: typer.Context) -> None:
     """Measure solvers, planners and growth on this machine."""
     if context.invoked_subcommand is None:
-        raise ProblemError("benchmark", ["of what? choose from solvers, planners, scaling"])
+        raise ProblemError("benchmark", ["of what? choose from solvers, nonlinear, planners, scaling"])
 
 
 Scenes = Annotated[str | None, typer.Option(help="Scenes, with semicolons (default: all).")]
+Every = Annotated[int, typer.Option(min=1, help="Steps of a mission from one timed to the next.")]
 Missions = Annotated[int, typer.Option(min=1, max=1000, help="Missions flown in each scene.")]
 
 
@@ -278,7 +279,7 @@ def benchmark_solvers(
         str | None, typer.Option("--solvers", help="Solvers, with semicolons (default: all).")
     ] = None,
     missions: Missions = 8,
-    every: Annotated[int, typer.Option(min=1, help="Steps of a mission from one timed to the next.")] = 20,
+    every: Every = 20,
     seed: Seed = 0,
     quiet: Quiet = False,
 ) -> None:
@@ -289,6 +290,19 @@ def benchmark_solvers(
     chosen_scenes, chosen = _chosen("scenes", scenes, SCENES), _chosen("solvers", contenders, CONTENDERS)
     say = partial(_say, quiet=quiet)
     _measured(run.benchmark_solvers(chosen_scenes, chosen, missions, every, seed, out, say), quiet)
+
+
+@benchmark.command("nonlinear")
+def benchmark_nonlinear(
+    out: Out = None, scenes: Scenes = None, missions: Missions = 4, every: Every = 40, seed: Seed = 0,
+    quiet: Quiet = False,
+) -> None:  # fmt: skip
+    """Compare the programs with those of the nonlinear quadrotor: times and first inputs."""
+    from napf_mpc.benchmark import run
+    from napf_mpc.benchmark.contenders import SCENES
+
+    chosen, say = _chosen("scenes", scenes, SCENES), partial(_say, quiet=quiet)
+    _measured(run.benchmark_nonlinear(chosen, missions, every, seed, out, say), quiet)
 
 
 @benchmark.command("planners")

@@ -51,7 +51,7 @@ HOMES = {
     "piqp": {"solvers/piqp_.py"},
     "highspy": {"solvers/qpsolvers_.py"},
     "numba": {"jit.py"},
-    "casadi": {"vehicle/quadrotor.py", "vehicle/codegen.py"},
+    "casadi": {"vehicle/quadrotor.py", "vehicle/codegen.py", "solvers/casadi_.py", "benchmark/nmpc.py"},
     "pymap3d": {"navigation/recorded.py", "world/city.py"},
     "pyarrow": {"store.py"},
     "matplotlib": {"plot/"},

@@ -268,7 +268,7 @@ def test_figures_show_medians_and_the_fit() -> None:
         ("scaling --budget nan", "less than or equal to 1000000"),
         ("scaling --seed -1", "seed = -1"),
         ("weather", "weather"),
-        ("", "of what? choose from solvers, planners, scaling"),
+        ("", "of what? choose from solvers, nonlinear, planners, scaling"),
     ],
 )
 def test_bad_input_is_one_clear_line(arguments: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:

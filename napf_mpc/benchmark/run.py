@@ -10,11 +10,19 @@ import numpy as np
 from napf_mpc import store
 from napf_mpc.benchmark.contenders import Contender, Scene
 from napf_mpc.benchmark.growth import Point, Study, growth
+from napf_mpc.benchmark.nonlinear import NonlinearRow, measure_nonlinear, nonlinear_summaries
 from napf_mpc.benchmark.planners import Pilot, PlannerRow, installed_pilots, measure_planner
 from napf_mpc.benchmark.scaling import grown
 from napf_mpc.benchmark.solvers import ALONE, Row, installed, measure, summaries
 from napf_mpc.benchmark.steps import StepTime
-from napf_mpc.benchmark.tables import machine, planner_tables, scaling_tables, tables, write
+from napf_mpc.benchmark.tables import (
+    machine,
+    nonlinear_tables,
+    planner_tables,
+    scaling_tables,
+    tables,
+    write,
+)
 from napf_mpc.block import check_campaign
 from napf_mpc.plot import Curve, draw_growth, draw_solvers, draw_step_times
 from napf_mpc.problem_file import load_problem
@@ -76,6 +84,44 @@ def _draw(
         {name: np.array([row.correct == 1 for row in of]) for name, of in alone.items()},
         1.0 / load_problem(scene.problem, scene.overrides).planner.rate_hz, out, stem, note,
     )  # fmt: skip
+
+
+def benchmark_nonlinear(
+    scenes: Mapping[str, Scene],
+    missions: int,
+    every: int,
+    seed: int,
+    out: Path | None,
+    tell: Callable[[str], None],
+) -> tuple[list[Rows], list[Path]]:
+    """Measure what the linearisation costs; files are kept as in :func:`benchmark_solvers`.
+
+    Returns
+    -------
+    tables : list of Rows
+        One a scene.
+    paths : list of Path
+        What was written: ``nonlinear.csv`` and ``nonlinear.md``.
+
+    Raises
+    ------
+    NapfError
+        If a setting is out of range or the folder cannot be written: before anything is flown. If flights
+        are too short for a scene.
+    """
+    check_campaign(["qp"], missions, seed)
+    if out is not None:
+        store.output_folder(out)
+    flights = f"{missions} missions a scene behind the filter, one step in {every}, seed {seed}."
+    rows: list[NonlinearRow] = []
+    paths: dict[Path, None] = {}
+    for label, scene in scenes.items():
+        rows += measure_nonlinear(label, scene, missions=missions, every=every, seed=seed)
+        tell(f"{label}: {len({row.step for row in rows if row.scene == label})} steps timed")
+        if out is not None:
+            wide = nonlinear_tables(nonlinear_summaries(rows), flights, wide=True)
+            paths |= dict.fromkeys(write(out, "nonlinear", rows, wide))
+    return nonlinear_tables(nonlinear_summaries(rows), flights, wide=False), list(paths)
 
 
 def benchmark_planners(

@@ -11,6 +11,8 @@ import gc
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from scipy.stats import binom
@@ -25,12 +27,14 @@ from napf_mpc.benchmark.contenders import (
 )
 from napf_mpc.benchmark.programs import Step, flown
 from napf_mpc.errors import ProblemError
-from napf_mpc.problem import Problem
+from napf_mpc.problem import Problem, Vehicle
 from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import Array, HorizonQp, Layout, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, make_batch_solver
 from napf_mpc.solvers.residuals import relative_residuals
-from napf_mpc.vehicle.quadrotor import mixer_inverse, rotor_limit
+from napf_mpc.vehicle.quadrotor import mixer, rotor_limit
+
+T = TypeVar("T")
 
 SOLVED = STATUSES.index(QpStatus.SOLVED)
 CORRECT = 1e-3
@@ -122,7 +126,7 @@ def _of_scene(
     contenders: Mapping[str, Contender],
     reference: BatchSolver,
 ) -> Iterator[Row]:
-    span = np.abs(np.linalg.inv(mixer_inverse(problem.vehicle))).sum(1) * rotor_limit(problem.vehicle)
+    span = input_span(problem.vehicle)
     solvers = {name: {ALONE: c.make(), TOGETHER: c.make()} for name, c in contenders.items()}
     names = order = list(contenders)
     for number, step in enumerate(steps):
@@ -138,7 +142,8 @@ def _of_scene(
                 solver = solvers[name][calls]
                 if not contender.keep:
                     solver.reset()
-                answer, cpu, wall = _timed(solver, shown if contender.warm else shown.cold())
+                warm = shown.warm if contender.warm else None
+                answer, cpu, wall = timed(partial(solver.solve_batch, shown.horizon, warm, shown.active))
                 off = _input_error(answer, truth, span)[shown.active]
                 rows[name] = Row(
                     label, name, calls, number, *at, shown.programs,
@@ -150,13 +155,18 @@ def _of_scene(
                 yield from (rows[name] for name in names)
 
 
-def _timed(solver: BatchSolver, step: Step) -> tuple[BatchResult, float, float]:
-    """Answer, thread-CPU and wall time [s]; collecting garbage is nobody's part."""
+def input_span(vehicle: Vehicle) -> Array:
+    """Range (4,) of each input that the rotors allow [N, N m]."""
+    return np.asarray(np.abs(mixer(vehicle)).sum(1) * rotor_limit(vehicle))
+
+
+def timed(call: Callable[[], T]) -> tuple[T, float, float]:
+    """Answer of a call, its thread-CPU and wall time [s]; collecting garbage is nobody's part."""
     collects = gc.isenabled()
     gc.disable()
     try:
         wall, cpu = time.perf_counter(), time.thread_time()
-        answer = solver.solve_batch(step.horizon, step.warm, step.active)
+        answer = call()
         return answer, time.thread_time() - cpu, time.perf_counter() - wall
     finally:
         if collects:
@@ -228,17 +238,24 @@ def summaries(rows: Sequence[Row]) -> list[Summary]:
                 p99,
                 most,
                 float(np.median([row.cpu_us for row in batch])),
-                _gain(of.get((scene, OSQP, ALONE)), alone),
-                _gain(of.get((scene, OSQP, TOGETHER)), batch),
+                gain(_times(of.get((scene, OSQP, ALONE), ())), _times(alone)),
+                gain(_times(of.get((scene, OSQP, TOGETHER), ())), _times(batch)),
             )
         )
     return out
 
 
-def _gain(rival: Sequence[Row] | None, mine: Sequence[Row]) -> tuple[float, float, float]:
-    """Median of the rival's times over mine, step by step, with the interval of its order statistics."""
-    if rival is None:
+def _times(rows: Sequence[Row]) -> list[float]:
+    return [row.cpu_us for row in rows]
+
+
+def gain(rival: Sequence[float], mine: Sequence[float]) -> tuple[float, float, float]:
+    """Median of a rival's times over mine, call by call, with the 95 % interval of its order statistics.
+
+    Without a rival there is none.
+    """
+    if not rival:
         return np.nan, np.nan, np.nan
-    ratio = np.sort([theirs.cpu_us / own.cpu_us for theirs, own in zip(rival, mine, strict=True)])
+    ratio = np.sort(np.array(rival) / np.array(mine))
     rank = max(int(binom.ppf(0.025, len(ratio), 0.5)), 1)
     return float(np.median(ratio)), float(ratio[rank - 1]), float(ratio[-rank])

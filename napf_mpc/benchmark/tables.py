@@ -17,6 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 from napf_mpc import store
 from napf_mpc.benchmark.contenders import OSQP, REFERENCE, REFERENCE_SETTINGS
 from napf_mpc.benchmark.growth import Point, Study, growth
+from napf_mpc.benchmark.nonlinear import NonlinearSummary
 from napf_mpc.benchmark.planners import SKIP, PlannerRow
 from napf_mpc.benchmark.solvers import CORRECT, Summary
 from napf_mpc.provenance import processor
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
 PACKAGES = (
     "napf-mpc", "numpy", "scipy", "numba", "osqp", "qpsolvers", "piqp", "proxsuite", "daqp", "clarabel",
-    "highspy", "cvxpy",
+    "highspy", "cvxpy", "casadi",
 )  # fmt: skip
 """Packages whose versions decide the times."""
 
@@ -106,6 +107,41 @@ def _ratio(gain: tuple[float, float, float], wide: bool) -> str:
     if math.isnan(median):
         return "-"
     return f"{median:.3g}" + (f" [{low:.3g}, {high:.3g}]" if wide else "")
+
+
+def nonlinear_tables(summaries: Sequence[NonlinearSummary], flights: str, wide: bool) -> list[Rows]:
+    """One table a scene; wide ones with 95th percentiles, largest times and intervals of gains."""
+    notes = (
+        flights,
+        "One program a mission and step. Off: largest difference of a first input to the quadratic "
+        "program's, as part of its range. Violation: median of the largest of rows and nonlinear dynamics.",
+        "Nonlinear: the quadrotor as it is, by IPOPT; the others are the quadratic program.",
+        f"Thread-CPU milliseconds; gain: time of {OSQP!r} over this one's, median [95 %] of the programs.",
+        machine(),
+    )
+    scenes = list(dict.fromkeys(one.scene for one in summaries))
+    shown = []
+    for scene in scenes:
+        cells = [
+            {
+                "program": one.contender,
+                "programs": str(one.programs),
+                "claimed": f"{one.claimed / one.programs:.1%}",
+                "iterations": f"{one.iterations:.0f}",
+                "off": f"{one.off_median:.1e}",
+                **({"off p95": f"{one.off_p95:.1e}"} if wide else {}),
+                "off max": f"{one.off_max:.1e}",
+                "violation": f"{one.violation:.0e}",
+                "median": f"{1e-3 * one.median_us:.3g}",
+                **({"p95": f"{1e-3 * one.p95_us:.3g}", "max": f"{1e-3 * one.max_us:.3g}"} if wide else {}),
+                "gain": _ratio(one.gain, wide),
+            }
+            for one in summaries
+            if one.scene == scene
+        ]
+        lines = tuple(tuple(line.values()) for line in cells)
+        shown.append(Rows(scene, tuple(cells[0]), lines, notes if scene == scenes[-1] else ()))
+    return shown
 
 
 def planner_tables(rows: Sequence[PlannerRow], flights: str) -> list[Rows]:

@@ -270,7 +270,10 @@ def _why(layout: Layout, values: Values) -> str:
     return "not shown to the solver: a slack has a negative penalty"
 
 
-_BATCH_SHIPPED = {"kernel": ("napf_mpc.solvers.kernel", "KernelSolver")}
+_BATCH_SHIPPED = {
+    "kernel": ("napf_mpc.solvers.kernel", "KernelSolver"),
+    "casadi-hpipm": ("napf_mpc.solvers.casadi_", "HpipmSolver"),
+}
 """Name -> module, imported on use, and class."""
 _BATCH_FACTORIES: dict[str, Callable[..., BatchSolver]] = {}
 
@@ -290,7 +293,7 @@ def register_batch_solver(name: str, factory: Callable[..., BatchSolver]) -> Non
 
 def batch_solver_names() -> tuple[str, ...]:
     """Names that :func:`make_batch_solver` takes, installed or not."""
-    return (*solver_names(), *_BATCH_SHIPPED, *_BATCH_FACTORIES)
+    return tuple(dict.fromkeys((*solver_names(), *_BATCH_SHIPPED, *_BATCH_FACTORIES)))
 
 
 def _shipped(name: str) -> Callable[..., BatchSolver]:

@@ -79,6 +79,9 @@ _SHIPPED = {
     **dict.fromkeys(("daqp", "clarabel", "highs"), ("napf_mpc.solvers.qpsolvers_", "napf-mpc[solvers]")),
     "proxqp": ("napf_mpc.solvers.qpsolvers_", "qpsolvers[proxqp]"),
     "quadprog": ("napf_mpc.solvers.qpsolvers_", "qpsolvers[quadprog]"),
+    **dict.fromkeys(
+        ("casadi-proxqp", "casadi-qpoases", "casadi-hpipm"), ("napf_mpc.solvers.casadi_", "casadi")
+    ),
 }
 """Name -> module, imported on use, and what to install for it."""
 

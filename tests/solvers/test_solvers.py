@@ -199,9 +199,12 @@ def test_infeasible_is_a_status(solver_name: str) -> None:
     solver = make_solver(solver_name)
     solver.setup(INFEASIBLE)
     result = solver.solve()
-    # DAQP, HiGHS and quadprog find out, but their adapter in qpsolvers does not say why they gave up.
-    silent = {"daqp", "highs", "quadprog"}
+    # DAQP, HiGHS and quadprog find out, but their adapter in qpsolvers does not say why they gave up. HPIPM
+    # only finds its step too short, and ProxQP goes on for as long as it may.
+    silent = {"daqp", "highs", "quadprog", "casadi-hpipm"}
     expected = QpStatus.FAILED if solver_name in silent else QpStatus.PRIMAL_INFEASIBLE
+    if solver_name == "casadi-proxqp":
+        expected = QpStatus.MAX_ITERATIONS
     assert result.status is expected
     assert result.message
     assert not result.residuals.within(1e-3, 1e-3)
