@@ -137,7 +137,7 @@ def test_a_hole_is_filled(hundred: Path, tmp_path: Path, monkeypatch: pytest.Mon
     assert timing["runs"].sum() == 2 * 100
 
 
-class Cut(Exception):
+class Cut(BaseException):
     """Stands for whatever ends a process."""
 
 

@@ -170,7 +170,6 @@ def test_the_module_is_the_command() -> None:
         ("figures nonsense --out O", "no such file"),
         ("figures . --out O --set planner.k=2", "is drawn as it was flown"),
         ("montecarlo P", "Missing option '--out'"),
-        ("montecarlo P --out O --cluster here", "No such option: --cluster"),
         ("run", "Missing argument"),
         ("run P P", "unexpected extra argument"),
         ("sweep P", "No such command 'sweep'"),
