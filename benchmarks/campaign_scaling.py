@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             import distributed
 
             cluster = stack.enter_context(
-                distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+                distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0")
             )
             address = cluster.scheduler_address
         table = ways(problem, asked.planner, asked.runs, asked.block, folder, address)

@@ -154,23 +154,44 @@ def connected(
     """
     name = f"--cluster {shown_text(address, 120)}"
     try:
-        import distributed
+        from distributed import Client
     except ImportError as error:
         raise NapfError(f"{name}: needs the package distributed: pip install 'napf-mpc[cluster]'") from error
     agree = partial(differing, dict(origin), problem, None if data_folder is None else data_folder.resolve())
     with _quiet(), contextlib.ExitStack() as stack:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of other versions: we look at those ourselves
-                client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-        except Exception as error:  # a malformed address, no such host, nobody there, no dask
-            reason = shown_text(" ".join(str(error).split()) or type(error).__name__, 160)
-            raise NapfError(f"{name}: no scheduler answers there: {reason}") from error
+        client = _client(Client, address, name)
         stack.callback(_leave, client)
         _check_workers(client, name, agree)
         cluster = Cluster(client, name, agree)
         stack.callback(cluster.close)
         yield cluster
+
+
+def _client(kind: Any, address: str, name: str) -> Any:
+    """Connect, or say in time that nobody answers."""
+    # Made in two steps, so that one that cannot connect can be closed, too: left to itself it complains.
+    client = kind.__new__(kind)
+    faults: list[Exception] = []
+
+    def connect() -> None:
+        try:
+            client.__init__(address, timeout=CONNECT_S, set_as_default=False)
+        except Exception as error:  # a malformed address, no such host, nobody there
+            faults.append(error)
+
+    # Their own time limit does not hold for somebody who listens there and never says a word.
+    trial = threading.Thread(target=connect, daemon=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of other versions: we look at those ourselves
+        trial.start()
+        trial.join(CONNECT_S + 1.0)
+    if trial.is_alive():
+        faults.append(TimeoutError(f"whoever listens there is silent for {CONNECT_S:g} s"))
+    if faults:
+        _leave(client)
+        reason = " ".join(str(faults[0]).split()) or type(faults[0]).__name__
+        raise NapfError(f"{name}: no scheduler answers there: {shown_text(reason, 160)}") from faults[0]
+    return client
 
 
 def _check_workers(client: Any, name: str, agree: Callable[[], list[str]]) -> None:
@@ -179,8 +200,12 @@ def _check_workers(client: Any, name: str, agree: Callable[[], list[str]]) -> No
         client.wait_for_workers(1, timeout=CONNECT_S)
     except TimeoutError as error:
         raise NapfError(f"{name}: has no workers; start some there with: dask worker ADDRESS") from error
+    try:
+        answers = client.run(agree, on_error="return")
+    except Exception as error:  # of the network
+        raise NapfError(f"{name}: the scheduler went away while its workers were asked") from error
     faults = []
-    for worker, found in sorted(client.run(agree, on_error="return").items()):
+    for worker, found in sorted(answers.items()):
         if isinstance(found, NapfError):
             faults.append(f"{name}: worker {worker}: {found}")
         elif isinstance(found, Exception):
@@ -223,13 +248,12 @@ def _on_worker(agree: Callable[[], list[str]], task: Callable[[range], Any], blo
 def _leave(client: Any) -> None:
     with contextlib.suppress(Exception):
         client.close(timeout=1.0)
+    client.status = "closed"  # whatever did not end in time: its finaliser would wait for it
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Leave it to our own messages to say what is wrong: theirs are long, and come from other threads."""
-    import distributed  # noqa: F401 - it sets its loggers up
-
     names = [name for name in logging.root.manager.loggerDict if name.startswith(("distributed", "tornado"))]
     loggers = [logger for name in names if not (logger := logging.getLogger(name)).disabled]
     try:

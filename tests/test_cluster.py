@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from campaign_torture import PROBLEM, START, finished
 
 from napf_mpc import cluster as cluster_module
 from napf_mpc.campaign import run_campaign
@@ -23,8 +24,11 @@ from napf_mpc.errors import NapfError
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.provenance import identity
+from napf_mpc.workers import Lost, in_pool
 
-distributed = pytest.importorskip("distributed", reason="needs the extra: pip install 'napf-mpc[cluster]'")
+NEEDED = "needs the extra: pip install 'napf-mpc[cluster]'"
+distributed = pytest.importorskip("distributed", reason=NEEDED)
+dask_config = pytest.importorskip("dask.config", reason=NEEDED)
 
 BRIEF: dict[str, Any] = {
     "mission": {"length_m": 1.0, "initial_velocities_mps": [[2.0, 0.0, 0.0]] * 4},
@@ -67,7 +71,7 @@ def fly(address: str, out: Path, **options: Any) -> str:
 def local() -> Iterator[str]:
     """Address of a scheduler in this process, with two worker processes."""
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs="CRITICAL"
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs="CRITICAL"
     ) as running:
         yield running.scheduler_address
 
@@ -84,15 +88,63 @@ def test_a_campaign_goes_on_from_one_engine_to_another(local: str, undisturbed: 
     assert fly(local, tmp_path, block_runs=5) == undisturbed
 
 
+def die(block: range) -> int:
+    """Kill the worker in one block."""
+    if block.start == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return sum(block)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+def test_a_block_that_kills_its_workers_is_lost_and_the_rest_goes_on() -> None:
+    blocks = [range(first, first + 3) for first in range(0, 12, 3)]
+    with (
+        dask_config.set({"distributed.scheduler.allowed-failures": 0}),
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=":0", silence_logs="CRITICAL"
+        ) as running,
+        connected(running.scheduler_address, origin(), brief()) as cluster,
+    ):
+        done = dict(in_pool(cluster.flying(die), blocks))
+    assert done.pop(range(3, 6)) == Lost("failed", "worker died", retried=True)
+    assert done == {block: sum(block) for block in blocks if block.start != 3}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+def test_a_stop_keeps_blocks_and_leaves_the_cluster_as_it_is(local: str, tmp_path: Path) -> None:
+    (tmp_path / "problem.toml").write_text(PROBLEM)
+    out = tmp_path / "out"
+    words = ["montecarlo", str(tmp_path / "problem.toml"), "--planner", "apf", "--runs", "9600"]
+    words += ["--out", str(out), "--cluster", local, "--quiet"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", START, *words], stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        deadline = time.monotonic() + WAIT_S
+        while not finished(out) and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert re.fullmatch(r"stopped: \d+ of 9600 runs are kept in .*; repeat the command to go on\n", stderr)
+    assert finished(out)
+    with distributed.Client(local, set_as_default=False) as client:
+        assert len(client.nthreads()) == 2
+
+
 # ----------------------------------------------------------------------------- processes of their own
 
 
 @contextlib.contextmanager
-def dask(*words: str, environment: dict[str, str] | None = None) -> Iterator[subprocess.Popen[str]]:
+def dask(*words: str, folder: Path | None = None) -> Iterator[subprocess.Popen[str]]:
     """Run a dask command in a group of its own, which ends with the block."""
     process = subprocess.Popen(
         [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]],
-        env=environment,
+        cwd=folder,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         text=True,
@@ -131,7 +183,7 @@ def address_of(address: str) -> tuple[str, int]:
 
 
 def worker(
-    address: str, environment: dict[str, str] | None = None, nanny: bool = True
+    address: str, folder: Path | None = None, nanny: bool = True
 ) -> contextlib.AbstractContextManager[subprocess.Popen[str]]:
     words = [
         "dask_worker",
@@ -141,7 +193,7 @@ def worker(
         "--no-dashboard",
         "--nanny" if nanny else "--no-nanny",
     ]
-    return dask(*words, environment=environment)
+    return dask(*words, folder=folder)
 
 
 def wait_for_workers(address: str, count: int) -> None:
@@ -249,7 +301,7 @@ def test_a_scheduler_without_workers_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster_module, "CONNECT_S", 3.0)
-    with distributed.LocalCluster(n_workers=0, dashboard_address=None, silence_logs="CRITICAL") as empty:
+    with distributed.LocalCluster(n_workers=0, dashboard_address=":0", silence_logs="CRITICAL") as empty:
         assert "has no workers" in complaint(capsys, empty.scheduler_address, tmp_path / "out")
 
 
@@ -281,8 +333,7 @@ def test_a_worker_without_the_package_is_named(tmp_path: Path) -> None:
     """A package of the same name that is empty stands in the way of ours."""
     (tmp_path / "napf_mpc").mkdir()
     (tmp_path / "napf_mpc" / "__init__.py").touch()
-    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-    with scheduler() as (address, _), worker(address, environment, nanny=False):
+    with scheduler() as (address, _), worker(address, tmp_path, nanny=False):
         wait_for_workers(address, 1)
         told = "cannot load this version of napf-mpc: ModuleNotFoundError: No module named 'napf_mpc.cluster'"
         with pytest.raises(NapfError, match=re.escape(told)), connected(address, origin(), brief()):
@@ -292,10 +343,3 @@ def test_a_worker_without_the_package_is_named(tmp_path: Path) -> None:
 def test_differences_are_none_in_the_same_process() -> None:
     assert differing(origin(), brief(), None) == []
     assert differing(origin() | {"problem_hash": "x"}, brief(), None)[0].endswith("not x")
-
-
-def test_without_the_package_the_way_out_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    assert "pip install 'napf-mpc[cluster]'" in complaint(capsys, "tcp://127.0.0.1:1", tmp_path / "out")
