@@ -40,7 +40,7 @@ BRIEF: dict[str, Any] = {
     "navigation.rate_hz": 5.0,
 }
 RUNS = 20
-WAIT_S = 120.0
+WAIT_S = 300.0
 
 
 def brief() -> Problem:
