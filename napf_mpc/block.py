@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from napf_mpc import store
 from napf_mpc.closed_loop import Scenario, build_scenario, closed_loop
 from napf_mpc.errors import ProblemError
-from napf_mpc.evaluate import MissionScore, Score
+from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
 from napf_mpc.planners.planner import Planner, tally_of
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.planners.tally import Tally
@@ -185,6 +185,31 @@ def score_rows(planner: str, seed: int, score: Score, tally: Tally | None = None
         **score.metrics,
         **(tally or Tally.none(runs)).columns(),
     }
+
+
+def lost_block(
+    planners: Sequence[str], seed: int, runs: range, uavs: int, outcome: Outcome, reason: str
+) -> Block:
+    """Return rows for runs that could not be flown: their seeds, an outcome and why, and no metrics."""
+    count = len(runs)
+    no = np.zeros(count, dtype=bool)
+    score = Score(
+        runs=np.arange(runs.start, runs.stop, dtype=np.int64),
+        outcome=(outcome,) * count,
+        obstacle_contact=np.zeros((count, uavs), dtype=bool),
+        uav_contact=no,
+        joint_success=no,
+        finished=no,
+        reason=(reason,) * count,
+        metrics={name: np.full(count, np.nan) for name in METRICS},
+    )
+    none = Tally.none(count)
+    return Block(
+        rows=store.stack([score_rows(name, seed, score) for name in planners]),
+        timing={name: values[:0] for name, values in timing_row(planners[0], runs, 0.0).items()},
+        trajectories={},
+        events=store.stack([none.event_columns(name, runs.start) for name in planners]),
+    )
 
 
 def timing_row(planner: str, runs: range, seconds: float) -> store.Columns:

@@ -1,27 +1,32 @@
 """Many missions: the same seeds for every planner, in blocks over workers, nothing lost.
 
 Each finished block is kept at once, so repeating the command goes on where it stopped. No result depends on
-block size, order or worker; wall times are kept apart from results.
+block size, order, worker or machine; wall times are kept apart from results.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from napf_mpc import store
-from napf_mpc.block import Block, Missions, check_campaign, fly_block, simulate
+from napf_mpc.block import Block, Missions, check_campaign, fly_block, lost_block, simulate
 from napf_mpc.campaign_folder import Blocks, conclude, taken
 from napf_mpc.closed_loop import Scenario, build_scenario
+from napf_mpc.cluster import connected
+from napf_mpc.errors import ProblemError
+from napf_mpc.evaluate import Outcome
 from napf_mpc.planners.registry import make_planner
+from napf_mpc.prefix import Prefix
 from napf_mpc.problem import Problem
 from napf_mpc.provenance import identity, versions
 from napf_mpc.scenario_file import write_scenario
 from napf_mpc.summary import summarise
-from napf_mpc.workers import in_workers
+from napf_mpc.words import shown_value
+from napf_mpc.workers import Lost, in_pool, in_workers
 
 __all__ = [
     "Block",
@@ -99,7 +104,11 @@ def run_campaign(
     block_runs: int | None = None,
     data_folder: Path | None = None,
     record_every: int = 0,
+    cluster: str | None = None,
+    block_limit_s: float | None = None,
+    enough: Callable[[store.Columns], bool] | None = None,
     progress: Callable[[int], None] = lambda done: None,
+    warn: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
     """Fly a campaign into a folder, going on where an earlier call of the same campaign stopped.
 
@@ -123,8 +132,17 @@ def run_campaign(
         Where data files lie.
     record_every : int
         Keep every n-th tick in ``trajectories.parquet``; 0 for none.
+    cluster : str, optional
+        Address of a running ``dask.distributed`` scheduler that flies the blocks instead of our own workers.
+    block_limit_s : float, optional
+        Time [s] after which a worker counts as hung with its block; see :func:`napf_mpc.workers.in_pool`.
+    enough : callable, optional
+        Stopping rule, asked about the rows of the first runs whenever those of the next one of
+        :func:`napf_mpc.prefix.looks` are all there. If it says yes, the campaign has that many runs.
     progress : callable
         Told the number of runs finished so far.
+    warn : callable
+        Told about every block that was lost twice and filed.
 
     Returns
     -------
@@ -141,26 +159,67 @@ def run_campaign(
         If the folder holds other results, is in use, or cannot be written.
     """
     check_campaign(planners, runs, seed, workers)
+    if block_limit_s is not None and not 0.0 < block_limit_s < float("inf"):
+        raise ProblemError("campaign", [f"block-limit = {shown_value(block_limit_s)}: must be > 0 seconds"])
     scenario = check_flyable(problem, planners, seed, data_folder)
     origin = identity(problem, name, planners, seed, data_folder) | {"record_every": record_every}
     fly = partial(
         fly_block, problem, tuple(planners), seed, data_folder=data_folder, record_every=record_every
     )
-    with taken(out, origin):
+    with contextlib.ExitStack() as stack:
+        pool = None
+        if cluster is not None:
+            pool = stack.enter_context(connected(cluster, origin, problem, data_folder)).flying(fly)
+        stack.enter_context(taken(out, origin))
         blocks = Blocks.of(out, origin)
-        done = {run for block in blocks.finished() for run in block if run < runs}
+        blocks.forget_lost()
+        finished = [block for block in blocks.finished() if block.start < runs]
+        done = {run for block in finished for run in block if run < runs}
         left = [run for run in range(runs) if run not in done]
-        size = block_runs or block_size(problem, scenario, len(left), workers, record_every)
+        prefix = None if enough is None else Prefix(enough, planners, runs)
+        if prefix is not None:
+            for block in finished:
+                prefix.add(block, blocks.table("rows", block))
+            if prefix.answer is not None:
+                left = []
+        slots = workers if pool is None else max(1, pool.slots())
+        cut = chunks(left, block_runs or block_size(problem, scenario, len(left), slots, record_every))
+        flown: Generator[tuple[range, Block | Lost], None, None] = (
+            in_workers(fly, cut, workers, block_limit_s)
+            if pool is None
+            else in_pool(pool, cut, block_limit_s)
+        )
         count = len(done)
         progress(count)
-        with contextlib.closing(in_workers(fly, chunks(left, size), workers)) as flown:
-            for block, results in flown:
-                blocks.add(block, results)
-                count += len(block)
+        with contextlib.closing(flown):
+            for chunk, result in flown:
+                kept = _kept(blocks, chunk, result, problem.uav_count, warn)
+                count += len(chunk)
                 progress(count)
+                if prefix is not None:
+                    prefix.add(chunk, kept.rows)
+                    if prefix.answer is not None:
+                        break
+        if prefix is not None and prefix.answer is not None:
+            runs = prefix.answer
         summary = conclude(out, blocks, runs)
         write_scenario(out / "scenario.json", problem, seed, range(runs), data_folder)
     return summary
+
+
+def _kept(blocks: Blocks, runs: range, result: Block | Lost, uavs: int, warn: Callable[[str], None]) -> Block:
+    """Keep a finished block; file a lost one."""
+    if not isinstance(result, Lost):
+        blocks.add(runs, result)
+        return result
+    planners, seed = blocks.identity["planners"], blocks.identity["seed"]
+    filed = lost_block(planners, seed, runs, uavs, Outcome(result.outcome), result.reason)
+    blocks.add(runs, filed, lost=True)
+    warn(
+        f"runs {runs.start} to {runs.stop - 1} were lost twice and are filed as {result.outcome}: "
+        f"{result.reason}; repeat the command to fly them again"
+    )
+    return filed
 
 
 def check_flyable(

@@ -1,8 +1,9 @@
 """The folder of a campaign: whose it is, which blocks are finished, and the tables made of them.
 
 A finished block is a file ``blocks/rows_<first>_<stop>.parquet``, with ``timing_``, ``events_`` and
-``trajectories_`` of the same runs beside it. ``runs.parquet``, ``timing.parquet``, ``events.parquet`` and
-``summary.json`` are made from the blocks, and made again whenever the command is repeated.
+``trajectories_`` of the same runs beside it. A block that was lost twice has ``lost_`` instead of ``rows_``:
+it is filed, and flown again when the command is repeated. ``runs.parquet``, ``timing.parquet``,
+``events.parquet`` and ``summary.json`` are made from the blocks, again whenever the command is repeated.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +26,7 @@ from napf_mpc.provenance import differences
 from napf_mpc.summary import summarise
 
 MARKER = "campaign.json"
-_BLOCK = re.compile(r"rows_(\d{8,})_(\d{8,})\.parquet")
+_BLOCK = re.compile(r"(rows|lost)_(\d{8,})_(\d{8,})\.parquet")
 _WAY_OUT = "delete this file and repeat the command: its runs are flown again"
 
 
@@ -96,15 +97,22 @@ class Blocks:
         store.remove_partial(blocks.folder)
         return blocks
 
-    def add(self, runs: range, block: Block) -> None:
-        """Keep a finished block."""
+    def add(self, runs: range, block: Block, *, lost: bool = False) -> None:
+        """Keep a finished block, or file a lost one."""
         tag = _tag(runs)
         store.write_table(self.folder / f"timing_{tag}", block.timing)
         store.write_table(self.folder / f"events_{tag}", block.events)
         if block.trajectories:
             store.write_table(self.folder / f"trajectories_{tag}", block.trajectories)
         # Last: a block counts as finished once its rows are there.
-        store.write_table(self.folder / f"rows_{tag}", block.rows, self._labels(runs))
+        kind = "lost" if lost else "rows"
+        store.write_table(self.folder / f"{kind}_{tag}", block.rows, self._labels(runs))
+
+    def forget_lost(self) -> None:
+        """Remove what was filed as lost: the runs count as never flown."""
+        for path in self.folder.glob("lost_*.parquet"):
+            if _BLOCK.fullmatch(path.name):
+                store.remove(path)
 
     def finished(self) -> list[range]:
         """Runs of every finished block, in order.
@@ -114,13 +122,7 @@ class Blocks:
         DataError
             If a file is damaged, not of this campaign, or holds runs that another holds too.
         """
-        found = []
-        for path in self.folder.glob("rows_*.parquet"):
-            if match := _BLOCK.fullmatch(path.name):
-                runs = range(int(match[1]), int(match[2]))
-                self._check(path, runs)
-                found.append(runs)
-        found.sort(key=lambda runs: (runs.start, runs.stop))
+        found = self._found("rows")
         for before, after in pairwise(found):
             if after.start < before.stop:
                 raise DataError(
@@ -128,6 +130,19 @@ class Blocks:
                     + _WAY_OUT
                 )
         return found
+
+    def lost(self) -> list[range]:
+        """Runs of every block that is filed as lost, in order."""
+        return self._found("lost")
+
+    def _found(self, kind: str) -> list[range]:
+        found = []
+        for path in self.folder.glob(f"{kind}_*.parquet"):
+            if match := _BLOCK.fullmatch(path.name):
+                runs = range(int(match[2]), int(match[3]))
+                self._check(path, runs)
+                found.append(runs)
+        return sorted(found, key=lambda runs: (runs.start, runs.stop))
 
     def _check(self, path: Path, runs: range) -> None:
         try:
@@ -148,6 +163,16 @@ class Blocks:
         except DataError as error:
             way_out = _WAY_OUT.replace("this file", str(self.folder / f"rows_{_tag(runs)}"))
             raise DataError(f"{error}; {way_out}") from error
+
+
+def first_runs(tables: Sequence[store.Columns], planners: Sequence[str], runs: int) -> store.Columns:
+    """Rows of the first runs by planner, then run, from tables in the order of their runs."""
+    return store.stack([_part(table, planner, runs) for planner in planners for table in tables])
+
+
+def _part(table: store.Columns, planner: str, runs: int) -> store.Columns:
+    kept = (table["planner"] == planner) & (table["run"] < runs)
+    return {name: values[kept] for name, values in table.items()}
 
 
 def _tag(runs: range) -> str:
@@ -171,26 +196,29 @@ def conclude(out: Path, blocks: Blocks, runs: int) -> dict[str, Any]:
     """
     planners = list(blocks.identity["planners"])
     finished = [block for block in blocks.finished() if block.start < runs]
-
-    def tables(kind: str) -> Iterator[store.Columns]:
-        """Rows of the first runs by planner, then run, whatever blocks they were flown in."""
-        for planner in planners:
-            for block in finished:
-                table = blocks.table(kind, block)
-                kept = (table["planner"] == planner) & (table["run"] < runs)
-                yield {name: values[kept] for name, values in table.items()}
-
-    rows = store.stack(list(tables("rows")))
+    lost = [block for block in blocks.lost() if block.start < runs]
+    in_order = sorted([*finished, *lost], key=lambda block: block.start)
+    rows = first_runs(
+        [blocks.table("lost" if block in lost else "rows", block) for block in in_order], planners, runs
+    )
     for planner in planners:
         if not np.array_equal(rows["run"][rows["planner"] == planner], np.arange(runs)):
             raise DataError(
                 f"{blocks.folder}: not every run of {planner} is there once; choose another --out"
             )
     store.write_table(out / "runs.parquet", rows)
-    store.write_table(out / "events.parquet", store.stack(list(tables("events"))))
-    store.write_table(out / "timing.parquet", store.stack([blocks.table("timing", b) for b in finished]))
-    if blocks.identity.get("record_every"):
-        store.write_tables(out / "trajectories.parquet", tables("trajectories"))
+    events = [blocks.table("events", block) for block in in_order]
+    store.write_table(out / "events.parquet", first_runs(events, planners, runs))
+    timing = [blocks.table("timing", block) for block in in_order]
+    store.write_table(out / "timing.parquet", store.stack(timing))
+    if blocks.identity.get("record_every") and finished:
+        # One block in memory at a time: trajectories are large.
+        parts = (
+            _part(blocks.table("trajectories", block), planner, runs)
+            for planner in planners
+            for block in finished
+        )
+        store.write_tables(out / "trajectories.parquet", parts)
     summary = summarise(rows, blocks.identity)
     store.write_json(out / "summary.json", summary)
     return summary

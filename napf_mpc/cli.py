@@ -46,6 +46,22 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="Print errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on standard output.")]
 Runs = Annotated[int, typer.Option(help="Number of runs.")]
 Workers = Annotated[int | None, typer.Option(help="Processes (default: one a core). Changes no result.")]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Fly on the workers of this dask scheduler (tcp://host:8786), whatever --workers is. "
+        "Changes no result.",
+    ),
+]
+BlockLimit = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        help="When a worker counts as hung with its block (default: after 20 times the slowest block, "
+        "at least half an hour).",
+    ),
+]
 Planner = Annotated[
     str | None, typer.Option(help="apf, napf, napf_guided, qp or qp_unguided (default: the problem's own).")
 ]
@@ -187,6 +203,8 @@ def compare(
     runs: Runs = 30,
     seed: Seed = 0,
     workers: Workers = None,
+    cluster: Cluster = None,
+    block_limit: BlockLimit = None,
     out: Out = None,
     settings: Settings = None,
     data: Data = None,
@@ -195,7 +213,8 @@ def compare(
 ) -> None:
     """Fly planners on the same seeds and compare them: the paper's Table 1 for any problem."""
     names = [name.strip() for name in planners.split(",") if name.strip()]
-    _campaign(_problem(file, settings), file, names, runs, seed, workers, out, data, quiet, as_json)
+    engine = _engine(workers, cluster, block_limit)
+    _campaign(_problem(file, settings), file, names, runs, seed, engine, out, data, quiet, as_json)
 
 
 @app.command()
@@ -206,6 +225,8 @@ def montecarlo(
     runs: Runs = 1000,
     seed: Seed = 0,
     workers: Workers = None,
+    cluster: Cluster = None,
+    block_limit: BlockLimit = None,
     trajectories: Annotated[
         bool, typer.Option("--trajectories", help="Keep trajectories at the planner's rate.")
     ] = False,
@@ -218,7 +239,8 @@ def montecarlo(
     problem = _problem(file, settings)
     ticks = round(problem.simulation.controller_rate_hz / problem.planner.rate_hz) if trajectories else 0
     names = [problem.planner.kind if planner is None else planner]
-    _campaign(problem, file, names, runs, seed, workers, out, data, quiet, as_json, ticks)
+    engine = _engine(workers, cluster, block_limit)
+    _campaign(problem, file, names, runs, seed, engine, out, data, quiet, as_json, ticks)
 
 
 @app.command()
@@ -372,7 +394,7 @@ def _campaign(
     names: list[str],
     runs: int,
     seed: int,
-    workers: int | None,
+    engine: dict[str, Any],
     out: Path | None,
     data: Path | None,
     quiet: bool,
@@ -397,8 +419,8 @@ def _campaign(
             )
 
         summary = run_campaign(
-            problem, names, runs, seed, kept, name=_name(file), workers=_processes(workers),
-            data_folder=data, record_every=record_every, progress=progress,
+            problem, names, runs, seed, kept, name=_name(file), data_folder=data,
+            record_every=record_every, progress=progress, warn=_warn, **engine,
         )  # fmt: skip
     from napf_mpc.report import comparison
 
@@ -426,6 +448,15 @@ def _progress(runs: int, silent: bool) -> Iterator[Callable[[int], None]]:
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("missions", total=runs)
         yield lambda done: bar.update(task, completed=done)
+
+
+def _warn(line: str) -> None:
+    print(f"warning: {line}", file=sys.stderr)
+
+
+def _engine(workers: int | None, cluster: str | None, block_limit: float | None) -> dict[str, Any]:
+    """Where a campaign is flown; changes none of its results."""
+    return {"workers": _processes(workers), "cluster": cluster, "block_limit_s": block_limit}
 
 
 def _processes(workers: int | None) -> int:

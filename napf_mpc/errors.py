@@ -23,6 +23,10 @@ class ProblemError(NapfError, ValueError):
         self.problems = list(problems)
         super().__init__("\n".join(f"{source}: {line}" for line in self.problems))
 
+    def __reduce__(self) -> tuple[type[ProblemError], tuple[str, list[str]]]:
+        # It comes from workers as it was raised; by default only the text would go along.
+        return type(self), (self.source, self.problems)
+
 
 class DataError(NapfError, ValueError):
     """A data file (city, navigation log, result) is missing, unreadable or inconsistent."""

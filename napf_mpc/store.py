@@ -63,6 +63,22 @@ def remove_partial(folder: Path) -> None:
             left.unlink()
 
 
+def remove(path: Path) -> None:
+    """Remove a file of ours.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be removed: {error.strerror or error}; choose another --out"
+        ) from error
+
+
 def write_bytes(path: Path, content: Callable[[IO[bytes]], object]) -> None:
     """Write a file through a callback, whole or not at all.
 

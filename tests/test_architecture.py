@@ -19,7 +19,9 @@ FLOORS: list[set[str]] = [
     {"mission", "figures", "benchmark"},
     {"report", "plot"},
     {"campaign"},
-    {"campaign_folder", "scenario_file", "workers"},
+    {"prefix"},
+    {"campaign_folder", "scenario_file", "cluster"},
+    {"workers"},
     {"goal_walk"},
     {"block"},
     {"summary", "record", "provenance"},
@@ -44,6 +46,7 @@ FLOORS: list[set[str]] = [
 ]
 
 HOMES = {
+    "distributed": {"cluster.py"},
     "fcl": {"world/audit.py"},
     "osqp": {"solvers/osqp_.py"},
     "cvxpy": {"solvers/cvxpy_.py"},
@@ -209,7 +212,7 @@ def python(code: str) -> str:
 def test_importing_the_package_loads_nothing_heavy() -> None:
     heavy = [
         "numpy", "scipy", "numba", "casadi", "matplotlib", "pyarrow", "pandas", "shapely", "fcl", "pydantic",
-        "joblib", "rich", "typer", "PIL", "pymap3d",
+        "joblib", "distributed", "rich", "typer", "PIL", "pymap3d",
     ]  # fmt: skip
     loaded = python(f"import napf_mpc, sys; print(*sorted(set({heavy!r}) & set(sys.modules)))")
     assert loaded == ""

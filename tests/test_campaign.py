@@ -15,6 +15,7 @@ from napf_mpc.block import MAX_RUNS, MAX_SEED, Block, check_campaign, fly_block,
 from napf_mpc.campaign import block_size, check_flyable, chunks, compare, run_campaign
 from napf_mpc.errors import DataError, NapfError, OutputError, ProblemError, SceneError
 from napf_mpc.evaluate import METRICS, Outcome
+from napf_mpc.prefix import Prefix, looks
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 
@@ -73,6 +74,14 @@ def test_the_first_runs_are_those_of_a_shorter_campaign(hundred: Path, tmp_path:
     first = long["run"] < 50
     for name, values in short.items():
         np.testing.assert_array_equal(values, long[name][first], err_msg=name)
+
+
+def test_sixty_of_a_hundred_and_twenty_are_a_campaign_of_sixty(tmp_path: Path) -> None:
+    """Also as bytes: what is cut to 60 runs is the file of 60 runs."""
+    fly(tmp_path / "a", 120, planners=["apf"], block_runs=64)
+    sixty = fly(tmp_path / "b", 60, planners=["apf"], block_runs=7)
+    assert digest(tmp_path / "a") != sixty
+    assert fly(tmp_path / "a", 60, planners=["apf"]) == sixty
 
 
 def test_another_seed_shares_no_run(hundred: Path, tmp_path: Path) -> None:
@@ -137,7 +146,7 @@ def test_a_hole_is_filled(hundred: Path, tmp_path: Path, monkeypatch: pytest.Mon
     assert timing["runs"].sum() == 2 * 100
 
 
-class Cut(Exception):
+class Cut(BaseException):
     """Stands for whatever ends a process."""
 
 
@@ -197,6 +206,130 @@ def test_progress_starts_with_what_is_there_and_ends_with_all(tmp_path: Path) ->
     told: list[int] = []
     fly(tmp_path, 20, block_runs=5, progress=told.append)
     assert told == [8, 13, 18, 20]
+
+
+# ------------------------------------------------------------------------------------- lost and flown again
+
+
+def broken_at(monkeypatch: pytest.MonkeyPatch, run: int) -> None:
+    """Let the block with a run raise what nobody expects."""
+
+    def flown(problem: Problem, planners: Any, seed: int, runs: range, **options: Any) -> Block:
+        if run in runs:
+            raise ZeroDivisionError("a slip of ours")
+        return fly_block(problem, planners, seed, runs, **options)
+
+    monkeypatch.setattr(campaign, "fly_block", flown)
+
+
+def test_a_block_that_is_lost_is_filed_with_its_seeds_and_flown_again(
+    hundred: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    with monkeypatch.context() as patch:
+        broken_at(patch, 47)
+        fly(tmp_path, 100, block_runs=20, warn=told.append)
+    (line,) = told
+    assert line.startswith(
+        "runs 40 to 59 were lost twice and are filed as failed: ZeroDivisionError: a slip of"
+    )
+    assert line.endswith("repeat the command to fly them again")
+    rows, whole = (store.read_table(folder / "runs.parquet") for folder in (tmp_path, hundred))
+    assert rows["run"].tolist() == whole["run"].tolist()
+    lost = (rows["run"] >= 40) & (rows["run"] < 60)
+    assert set(rows["outcome"][lost]) == {"failed"}
+    assert set(rows["seed"][lost]) == {7}
+    assert set(rows["uavs"][lost]) == {4}
+    assert all(
+        reason.startswith("ZeroDivisionError: a slip of ours (test_campaign")
+        for reason in rows["reason"][lost]
+    )
+    for name, values in rows.items():
+        assert values.dtype.kind == whole[name].dtype.kind, name
+        np.testing.assert_array_equal(values[~lost], whole[name][~lost], err_msg=name)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["planners"]["apf"]["failed"] == 20
+    assert list(summary["planners"]["apf"]["reasons"].values()) == [20]
+    again = flown_by(monkeypatch)
+    assert fly(tmp_path, 100, block_runs=20) == digest(hundred)
+    assert again == [range(40, 60)]
+    assert not list((tmp_path / "blocks").glob("lost_*"))
+
+
+def test_a_campaign_that_is_lost_altogether_says_so_and_can_be_flown_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        broken_at(patch, 1)
+        fly(tmp_path / "a", 4, record_every=5)
+    rows = store.read_table(tmp_path / "a" / "runs.parquet")
+    assert rows["outcome"].tolist() == ["failed"] * 8
+    assert set(store.read_table(tmp_path / "a" / "events.parquet")) >= {"planner", "run", "cause"}
+    assert fly(tmp_path / "a", 4, record_every=5) == fly(tmp_path / "b", 4, record_every=5)
+
+
+def test_what_is_made_of_the_blocks_can_be_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = fly(tmp_path, 12, block_runs=5)
+    summary = (tmp_path / "summary.json").read_bytes()
+    for name in ("runs.parquet", "summary.json", "events.parquet", "timing.parquet", "scenario.json"):
+        (tmp_path / name).unlink()
+    flown = flown_by(monkeypatch)
+    assert fly(tmp_path, 12, block_runs=5) == before
+    assert flown == []
+    assert (tmp_path / "summary.json").read_bytes() == summary
+
+
+# --------------------------------------------------------------------------------------------- stopping rules
+
+
+def test_looks_are_fixed_and_grow() -> None:
+    assert looks(120) == [50, 100, 120]
+    assert looks(20) == [20]
+    far = looks(100_000)
+    assert far[:21] == list(range(50, 1051, 50))
+    assert far[-1] == 100_000
+    assert len(far) < 150
+
+
+@pytest.mark.parametrize(("workers", "block_runs"), [(1, 100), (1, 7), (2, 30)])
+def test_a_stopping_rule_ends_a_campaign_at_the_same_run_whatever_the_blocks(
+    workers: int, block_runs: int, tmp_path: Path
+) -> None:
+    asked: list[tuple[list[int], list[str]]] = []
+
+    def enough(rows: store.Columns) -> bool:
+        runs = rows["run"][rows["planner"] == "napf"]
+        asked.append((runs.tolist(), list(dict.fromkeys(rows["planner"]))))
+        return len(runs) >= 100
+
+    ended = fly(tmp_path / "a", 300, workers=workers, block_runs=block_runs, enough=enough)
+    assert asked == [(list(range(n)), ["apf", "napf"]) for n in (50, 100)]
+    assert ended == fly(tmp_path / "b", 100)
+    asked.clear()
+    assert fly(tmp_path / "a", 300, enough=enough) == ended  # nothing more is flown
+    assert len(asked) == 2
+
+
+def test_a_stopping_rule_waits_for_the_runs_before() -> None:
+    told: list[int] = []
+
+    def enough(rows: store.Columns) -> bool:
+        told.append(len(rows["run"]))
+        return False
+
+    prefix = Prefix(enough, ["apf"], 120)
+
+    def rows(block: range) -> store.Columns:
+        return {"planner": np.full(len(block), "apf"), "run": np.array(block)}
+
+    for block in (range(60, 120), range(30, 60)):
+        prefix.add(block, rows(block))
+        assert told == []
+    prefix.add(range(30), rows(range(30)))
+    assert told == [50, 100, 120]
+    assert prefix.answer is None
 
 
 # ----------------------------------------------------------------------------------------- nothing is mixed

@@ -156,6 +156,11 @@ def test_the_module_is_the_command() -> None:
         ("compare P --planners napf,apf,napf", "planners = napf,apf,napf: each may be named once"),
         ("compare P --workers 0", "workers = 0: must be a whole number from 1 to 1024"),
         ("compare P --workers 5000", "workers = 5000"),
+        ("compare P --block-limit 0", "block-limit = 0"),
+        ("montecarlo P --out O --block-limit nan", "block-limit = nan"),
+        ("montecarlo P --out O --runs 0", "runs = 0: must be a whole number from 1 to 10000000"),
+        ("montecarlo P --out O --runs 1e12", "Invalid value for '--runs'"),
+        (f"montecarlo P --out O --seed {2**200}", "seed = an integer of more than 60 digits"),
         ("run P --run-index -1", "run-index = -1: must be a whole number from 0 to 9999999"),
         ("run P --run-index 99999999999", "run-index = 99999999999"),
         ("run nowhere.toml", "nowhere.toml: no such file and no shipped problem of this name"),
@@ -170,7 +175,6 @@ def test_the_module_is_the_command() -> None:
         ("figures nonsense --out O", "no such file"),
         ("figures . --out O --set planner.k=2", "is drawn as it was flown"),
         ("montecarlo P", "Missing option '--out'"),
-        ("montecarlo P --out O --cluster here", "No such option: --cluster"),
         ("run", "Missing argument"),
         ("run P P", "unexpected extra argument"),
         ("sweep P", "No such command 'sweep'"),
@@ -187,6 +191,25 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(
     assert told in err
     assert err.startswith("error: ")
     assert err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("command", ["compare", "montecarlo"])
+def test_a_cluster_needs_a_package_and_the_way_to_it_is_named(
+    command: str,
+    problem: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)  # as if it were not installed
+    words = [command, problem, "--out", tmp_path / "out", "--cluster", "tcp://127.0.0.1:8786"]
+    code, out, err = done(capsys, *words)
+    assert (code, out) == (2, "")
+    assert err == (
+        "error: --cluster tcp://127.0.0.1:8786: needs the package distributed: "
+        "pip install 'napf-mpc[cluster]'\n"
+    )
     assert not (tmp_path / "out").exists()
 
 

@@ -43,6 +43,16 @@ def test_a_mission_is_its_row_of_the_campaign_to_the_last_bit(planner: str, run:
     assert flown.reached == (flown.row["outcome"] == "reached")
 
 
+def test_a_mission_of_the_qp_planner_is_its_row_of_the_campaign_to_the_last_bit(tmp_path: Path) -> None:
+    problem = load_problem("table1_8", BRIEF | {"simulation.time_limit_s": 2.0})
+    run_campaign(problem, ["qp"], 3, 4, tmp_path, block_runs=3)
+    rows = store.read_table(tmp_path / "runs.parquet")
+    flown = fly_mission(problem, "brief", "qp", seed=4, run=1)
+    assert flown.row["solves_solved"] > 50
+    for name, value in flown.row.items():
+        np.testing.assert_array_equal(value, rows[name][1], err_msg=name)
+
+
 def test_the_verdict_follows_from_the_stored_files_alone(tmp_path: Path) -> None:
     """Every physics step is a tick here, so the stored track is the path that was judged."""
     out = tmp_path / "out"

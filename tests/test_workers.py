@@ -1,6 +1,7 @@
 """Blocks over processes: all of them once, errors as they are, and a dead worker is no disaster."""
 
 import os
+import re
 import signal
 import sys
 import time
@@ -9,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from napf_mpc.errors import NapfError, SceneError
-from napf_mpc.workers import MAX_DEATHS, in_workers
+from napf_mpc.errors import NapfError, ProblemError
+from napf_mpc.workers import DIED, HUNG, MAX_LOST, Lost, in_workers
 
 BLOCKS = [range(first, first + 3) for first in range(0, 30, 3)]
 
@@ -21,19 +22,28 @@ def total(block: range) -> tuple[int, int]:
 
 def fail(block: range) -> int:
     if block.start == 6:
-        raise SceneError("run 7: no room")
+        raise ProblemError("run 7", ["no room", "no air"])
     return 0
 
 
-def die(folder: Path, times: int, block: range) -> int:
-    """Kill its own process in one block, so many times."""
+def strike(folder: Path, times: int, how: str, block: range) -> int:
+    """Fail in one block, so many times: be killed, raise what nobody expects, hang or stand still."""
     if block.start == 12:
         for i in range(times):
-            mark = folder / f"death{i}"
+            mark = folder / f"strike{i}"
             if not mark.exists():
                 mark.touch()
-                os.kill(os.getpid(), signal.SIGKILL)
+                if how == "error":
+                    raise ZeroDivisionError("nothing\nto divide by")
+                if how == "hang":
+                    time.sleep(600.0)
+                os.kill(os.getpid(), {"die": signal.SIGKILL, "stop": signal.SIGSTOP}[how])
+                time.sleep(600.0)
     return sum(block)
+
+
+def always(block: range) -> int:
+    raise ZeroDivisionError
 
 
 def wait(folder: Path, block: range) -> int:
@@ -58,21 +68,46 @@ def test_one_block_is_not_worth_a_process() -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_error_comes_as_it_was_raised(workers: int) -> None:
-    with pytest.raises(SceneError, match="run 7: no room"):
+    with pytest.raises(ProblemError, match="run 7: no room\nrun 7: no air") as caught:
         list(in_workers(fail, BLOCKS, workers))
+    assert caught.value.problems == ["no room", "no air"]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="kill -9 is POSIX")
-def test_a_worker_that_dies_costs_its_block_a_second_try(tmp_path: Path) -> None:
-    done = dict(in_workers(partial(die, tmp_path, MAX_DEATHS - 1), BLOCKS, 2))
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+@pytest.mark.parametrize(("how", "workers"), [("die", 2), ("error", 1), ("error", 2), ("hang", 2)])
+def test_a_failure_costs_its_block_a_second_try(how: str, workers: int, tmp_path: Path) -> None:
+    done = dict(in_workers(partial(strike, tmp_path, 1, how), BLOCKS, workers, limit_s=10.0))
     assert done == {block: sum(block) for block in BLOCKS}
-    assert len(list(tmp_path.iterdir())) == MAX_DEATHS - 1
+    assert len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="kill -9 is POSIX")
-def test_a_block_that_kills_every_worker_is_given_up_with_its_place(tmp_path: Path) -> None:
-    with pytest.raises(NapfError, match=f"workers died {MAX_DEATHS} times in a row at run 12 or after it"):
-        list(in_workers(partial(die, tmp_path, 99), BLOCKS, 2))
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+@pytest.mark.parametrize(
+    ("how", "workers", "lost"), [("die", 2, DIED), ("error", 1, None), ("error", 2, None), ("stop", 2, HUNG)]
+)
+def test_a_block_that_fails_twice_is_lost_and_the_rest_goes_on(
+    how: str, workers: int, lost: Lost | None, tmp_path: Path
+) -> None:
+    done = dict(in_workers(partial(strike, tmp_path, 99, how), BLOCKS, workers, limit_s=10.0))
+    assert len(list(tmp_path.iterdir())) == 2
+    found = done.pop(range(12, 15))
+    assert done == {block: sum(block) for block in BLOCKS if block.start != 12}
+    if lost is None:
+        assert isinstance(found, Lost)
+        assert found.outcome == "failed"
+        assert re.fullmatch(r"ZeroDivisionError: nothing to divide by \(test_workers\.py:\d+\)", found.reason)
+    else:
+        assert found == lost
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_when_block_after_block_is_lost_nothing_more_is_tried(workers: int) -> None:
+    blocks = [range(first, first + 1) for first in range(3 * MAX_LOST)]
+    flown = in_workers(always, blocks, workers)
+    for _ in range(MAX_LOST - 1):
+        assert isinstance(next(flown)[1], Lost)
+    with pytest.raises(NapfError, match=f"{MAX_LOST} blocks in a row were lost, .*: ZeroDivisionError"):
+        next(flown)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="process ids are looked up as POSIX does")
