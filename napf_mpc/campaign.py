@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from napf_mpc import store
 from napf_mpc.block import Block, Missions, check_campaign, fly_block, simulate
 from napf_mpc.campaign_folder import Blocks, conclude, taken
@@ -100,6 +102,7 @@ def run_campaign(
     data_folder: Path | None = None,
     record_every: int = 0,
     progress: Callable[[int], None] = lambda done: None,
+    enough: Callable[[store.Columns], bool] | None = None,
 ) -> dict[str, Any]:
     """Fly a campaign into a folder, going on where an earlier call of the same campaign stopped.
 
@@ -125,6 +128,9 @@ def run_campaign(
         Keep every n-th tick in ``trajectories.parquet``; 0 for none.
     progress : callable
         Told the number of runs finished so far.
+    enough : callable, optional
+        Asked of the rows of the first n runs for every n in turn (see :mod:`napf_mpc.stopping`); the campaign
+        is that of the first n at which it says yes, whatever was flown beyond. ``runs`` is then the most.
 
     Returns
     -------
@@ -148,19 +154,61 @@ def run_campaign(
     )
     with taken(out, origin):
         blocks = Blocks.of(out, origin)
-        done = {run for block in blocks.finished() for run in block if run < runs}
+        finished = blocks.finished()
+        done = {run for block in finished for run in block if run < runs}
+        first = _FirstRuns(enough, runs)
+        for block in finished if enough is not None else ():
+            first.add(block, blocks.table("rows", block))
         left = [run for run in range(runs) if run not in done]
         size = block_runs or block_size(problem, scenario, len(left), workers, record_every)
         count = len(done)
         progress(count)
-        with contextlib.closing(in_workers(fly, chunks(left, size), workers)) as flown:
+        todo = [] if first.enough_at else chunks(left, size)
+        with contextlib.closing(in_workers(fly, todo, workers)) as flown:
             for block, results in flown:
                 blocks.add(block, results)
                 count += len(block)
                 progress(count)
-        summary = conclude(out, blocks, runs)
-        write_scenario(out / "scenario.json", problem, seed, range(runs), data_folder)
+                first.add(block, results.rows)
+                if first.enough_at:
+                    break
+        kept = first.enough_at or runs
+        summary = conclude(out, blocks, kept)
+        if enough is not None:
+            summary["stopping"] = {"rule": str(enough), "met": first.enough_at > 0, "most_runs": runs}
+            store.write_json(out / "summary.json", summary)
+        write_scenario(out / "scenario.json", problem, seed, range(kept), data_folder)
     return summary
+
+
+class _FirstRuns:
+    """Rows of the runs from 0 on without gaps, and how many of them are enough."""
+
+    def __init__(self, enough: Callable[[store.Columns], bool] | None, most: int) -> None:
+        self.enough_at = 0
+        self._enough, self._most = enough, most
+        self._waiting: dict[int, tuple[int, store.Columns]] = {}
+        self._rows: store.Columns = {}
+        self._stop = 0
+
+    def add(self, block: range, rows: store.Columns) -> None:
+        """Take a finished block, in whatever order they come."""
+        if self._enough is None or self.enough_at:
+            return
+        order = np.argsort(rows["run"], kind="stable")
+        self._waiting[block.start] = block.stop, {name: values[order] for name, values in rows.items()}
+        while self._stop in self._waiting and not self.enough_at:
+            stop, rows = self._waiting.pop(self._stop)
+            self._rows = store.stack([self._rows, rows]) if self._stop else rows
+            self._ask(self._enough, stop)
+
+    def _ask(self, enough: Callable[[store.Columns], bool], stop: int) -> None:
+        planners = len(self._rows["run"]) // stop
+        for runs in range(self._stop + 1, min(stop, self._most) + 1):
+            if enough({name: values[: runs * planners] for name, values in self._rows.items()}):
+                self.enough_at = runs
+                return
+        self._stop = stop
 
 
 def check_flyable(

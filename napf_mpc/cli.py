@@ -18,6 +18,7 @@ from napf_mpc.errors import NapfError, ProblemError
 if TYPE_CHECKING:
     from napf_mpc.problem import Problem
     from napf_mpc.report import Rows
+    from napf_mpc.stopping import StoppingRule
 
 T = TypeVar("T")
 
@@ -206,6 +207,14 @@ def montecarlo(
     runs: Runs = 1000,
     seed: Seed = 0,
     workers: Workers = None,
+    until_width: Annotated[
+        float | None,
+        typer.Option(help="Stop once the interval of the risk is narrower than this; --runs is the most."),
+    ] = None,
+    until_upper: Annotated[
+        float | None,
+        typer.Option(help="Stop once the upper end of that interval is below this; --runs is the most."),
+    ] = None,
     trajectories: Annotated[
         bool, typer.Option("--trajectories", help="Keep trajectories at the planner's rate.")
     ] = False,
@@ -218,7 +227,12 @@ def montecarlo(
     problem = _problem(file, settings)
     ticks = round(problem.simulation.controller_rate_hz / problem.planner.rate_hz) if trajectories else 0
     names = [problem.planner.kind if planner is None else planner]
-    _campaign(problem, file, names, runs, seed, workers, out, data, quiet, as_json, ticks)
+    rule = None
+    if until_width is not None or until_upper is not None:
+        from napf_mpc.stopping import StoppingRule
+
+        rule = StoppingRule(until_width, until_upper)
+    _campaign(problem, file, names, runs, seed, workers, out, data, quiet, as_json, ticks, rule)
 
 
 @app.command()
@@ -364,6 +378,7 @@ def _campaign(
     quiet: bool,
     as_json: bool,
     record_every: int = 0,
+    rule: StoppingRule | None = None,
 ) -> None:
     from contextlib import ExitStack
     from tempfile import TemporaryDirectory
@@ -384,7 +399,7 @@ def _campaign(
 
         summary = run_campaign(
             problem, names, runs, seed, kept, name=_name(file), workers=_processes(workers),
-            data_folder=data, record_every=record_every, progress=progress,
+            data_folder=data, record_every=record_every, progress=progress, enough=rule,
         )  # fmt: skip
     from napf_mpc.report import comparison
 

@@ -39,7 +39,7 @@ FLOORS: list[set[str]] = [
     {"problem_file"},
     {"problem_faults"},
     {"problem"},
-    {"store", "data_folder", "overrides"},
+    {"store", "data_folder", "overrides", "stopping"},
     {"risk", "first_passage", "shipped", "interrupts", "streams", "jit", "errors", "words"},
 ]
 

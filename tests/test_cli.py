@@ -170,6 +170,10 @@ def test_the_module_is_the_command() -> None:
         ("figures nonsense --out O", "no such file"),
         ("figures . --out O --set planner.k=2", "is drawn as it was flown"),
         ("montecarlo P", "Missing option '--out'"),
+        ("montecarlo P --out O --until-width 0", "until-width = 0: must be a rate above 0 and below 1"),
+        ("montecarlo P --out O --until-upper 2", "until-upper = 2: must be a rate above 0 and below 1"),
+        ("montecarlo P --out O --until-upper nan", "until-upper = nan: must be a rate"),
+        ("montecarlo P --out O --until-upper x", "Invalid value for '--until-upper'"),
         ("montecarlo P --out O --cluster here", "No such option: --cluster"),
         ("run", "Missing argument"),
         ("run P P", "unexpected extra argument"),
@@ -424,6 +428,24 @@ def test_montecarlo_goes_on_where_it_stopped(
     assert done(capsys, *words, "--runs", "11", "--out", tmp_path / "b") == (0, "", "")
     assert digest(tmp_path / "a") == digest(tmp_path / "b")
     assert set(first) < set((tmp_path / "a" / "blocks").iterdir())
+
+
+def test_montecarlo_stops_when_enough_is_known(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["montecarlo", problem, "--planner", "apf", "--seed", "2", "--workers", "1", "--out", out]
+    code, text, err = done(capsys, *words, "--runs", "60", "--until-width", "0.6", "--until-upper", "0.001")
+    assert (code, err) == (0, "")
+    assert "Stopping rule until-width 0.6 or until-upper 0.001: met after" in text
+    runs = len(store.read_table(out / "runs.parquet")["run"])
+    assert runs < 30
+    assert f"met after {runs} of at most 60 runs" in (out / "comparison.md").read_text()
+    # The same folder serves a rule that asks for more, and a fixed number of runs.
+    assert done(capsys, *words, "--runs", "60", "--until-width", "0.5", "--quiet")[0] == 0
+    assert runs < len(store.read_table(out / "runs.parquet")["run"]) < 60
+    assert done(capsys, *words, "--runs", "60", "--quiet")[0] == 0
+    assert "stopping" not in json.loads((out / "summary.json").read_text())
 
 
 def test_montecarlo_flies_the_problems_own_planner_and_keeps_trajectories(
