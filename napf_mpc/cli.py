@@ -236,6 +236,46 @@ def montecarlo(
 
 
 @app.command()
+def rare(
+    file: File,
+    out: OutNeeded,
+    planner: Planner = None,
+    samples: Annotated[int, typer.Option(help="Missions a level: 1000 for a risk to about a third.")] = 1000,
+    seed: Seed = 0,
+    settings: Settings = None,
+    data: Data = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Estimate a collision risk too small to count, by subset simulation; repeat the command to go on."""
+    problem = _problem(file, settings)
+    from napf_mpc.rare_events.estimate import check_samples, estimate_collision_risk
+
+    check_samples(samples)
+    with _progress(None, quiet or as_json) as tell:
+
+        def progress(done: int) -> None:
+            interrupts.raise_if_asked()
+            tell(done)
+            interrupts.when_stopped(
+                f"stopped: {done} missions are kept in {out}; repeat the command to go on"
+            )
+
+        summary = estimate_collision_risk(
+            problem, problem.planner.kind if planner is None else planner, out, samples=samples, seed=seed,
+            name=_name(file), data_folder=data, progress=progress,
+        )  # fmt: skip
+    from napf_mpc import store
+    from napf_mpc.report import rare_table
+
+    table = rare_table(summary)
+    store.write_bytes(out / "rare.md", lambda file: file.write(table.markdown().encode()))
+    if not as_json:
+        _show(table, quiet)
+    _end(summary, out, quiet, as_json)
+
+
+@app.command()
 def figures(
     source: Annotated[str, typer.Argument(metavar="FILE_OR_DIR", help="Problem, or folder with results.")],
     out: OutNeeded,
@@ -416,8 +456,8 @@ def _campaign(
 
 
 @contextmanager
-def _progress(runs: int, silent: bool) -> Iterator[Callable[[int], None]]:
-    """Progress bar on a terminal, nothing anywhere else."""
+def _progress(runs: int | None, silent: bool) -> Iterator[Callable[[int], None]]:
+    """Progress bar on a terminal, nothing anywhere else; without a number of runs it has no end."""
     if silent or not sys.stderr.isatty():
         yield lambda done: None
         return

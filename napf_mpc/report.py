@@ -194,6 +194,39 @@ def _reference_note(reference: Reference) -> str:
     return shown_text(f"{words} {reference.note}".strip(), 2000)
 
 
+def rare_table(summary: dict[str, Any]) -> Rows:
+    """Estimate of a small collision risk, and the levels it is made of."""
+    levels = summary["levels"]
+    if summary["reached"]:
+        ends = f"[{summary['collision_risk_low']:.2g}, {summary['collision_risk_high']:.2g}]"
+        cells = [("collision risk, any UAV and obstacle", f"{summary['collision_risk']:.2e} {ends}")]
+        cells.append(("  coefficient of variation, levels independent", f"{summary['cov']:.2f}"))
+        cells.append(("  the same, all levels erring together", f"{summary['cov_bound']:.2f}"))
+        risk, cov = summary["collision_risk"], summary["cov"]
+        if cov:
+            cells.append(("missions that counting would take for it", f"{(1 - risk) / (risk * cov**2):,.0f}"))
+    else:
+        cells = [("collision risk, any UAV and obstacle", f"not reached; below about {summary['below']:.0e}")]
+    cells.append(("missions flown", f"{summary['calls']:,}"))
+    cells.append(("  of them failed, counted as contacts", f"{summary['failed']:,}"))
+    for number, level in enumerate(levels, 1):
+        taken = "" if level["accepted"] is None else f", {100 * level['accepted']:.0f} % of steps taken"
+        cells.append(
+            (
+                f"level {number}: clearance <= {level['threshold']:.3f} m",
+                f"{100 * level['probability']:.1f} %{taken}",
+            )
+        )
+    notes = (
+        f"Subset simulation, {summary['samples']} missions a level, {summary['dimension']} random numbers a "
+        f"mission, seed {summary['seed']}.",
+        "Interval: 95 %, log-normal, as if all levels erred together. It does not know of a way to collide "
+        "that no mission came near: compare several seeds.",
+    )
+    title = f"{shown_text(summary['problem'], 200)}, planner {summary['planner']}"
+    return Rows(title, ("", "value"), tuple(cells), notes)
+
+
 def mission_table(row: dict[str, Any], name: str) -> Rows:
     """Outcome and metrics of one mission."""
     cells = [("outcome", str(row["outcome"]))]

@@ -45,7 +45,7 @@ source = "A paper"
 runs = 30
 collision_risk = { apf = 0.7333, napf = 0.1667 }
 """
-COMMANDS = ["problems", "validate", "run", "compare", "montecarlo", "figures"]
+COMMANDS = ["problems", "validate", "run", "compare", "montecarlo", "rare", "figures"]
 
 
 @pytest.fixture
@@ -174,6 +174,13 @@ def test_the_module_is_the_command() -> None:
         ("montecarlo P --out O --until-upper 2", "until-upper = 2: must be a rate above 0 and below 1"),
         ("montecarlo P --out O --until-upper nan", "until-upper = nan: must be a rate"),
         ("montecarlo P --out O --until-upper x", "Invalid value for '--until-upper'"),
+        ("rare P --out O --samples 15", "samples = 15: must be a multiple of 10 from 20 to 1000000"),
+        ("rare P --out O --samples 0", "samples = 0"),
+        ("rare P --out O --seed -1", "seed = -1"),
+        ("rare P --out O --planner no", '"no" is not a planner'),
+        ("rare P", "Missing option '--out'"),
+        ("rare single_uav --out O", "mission.kind"),
+        ("rare P --out O --set world.kind=empty --set world.count=1", "world"),
         ("montecarlo P --out O --cluster here", "No such option: --cluster"),
         ("run", "Missing argument"),
         ("run P P", "unexpected extra argument"),
@@ -446,6 +453,22 @@ def test_montecarlo_stops_when_enough_is_known(
     assert runs < len(store.read_table(out / "runs.parquet")["run"]) < 60
     assert done(capsys, *words, "--runs", "60", "--quiet")[0] == 0
     assert "stopping" not in json.loads((out / "summary.json").read_text())
+
+
+def test_rare_estimates_and_goes_on(problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    words = ["rare", problem, "--planner", "apf", "--samples", "40", "--seed", "3", "--out", out]
+    code, text, err = done(capsys, *words)
+    assert (code, err) == (0, "")
+    assert "collision risk, any UAV and obstacle" in text
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["method"] == "subset simulation"
+    assert len(store.read_table(out / "calls.parquet")["clearance_m"]) == summary["calls"]
+    assert "| level 1: clearance <= " in (out / "rare.md").read_text()
+    assert json.loads(done(capsys, *words, "--json")[1]) == summary
+    code, _, err = done(capsys, *[word if word != "3" else "4" for word in words])
+    assert (code, err.count("\n")) == (2, 1)
+    assert "seed = 3, not 4" in err
 
 
 def test_montecarlo_flies_the_problems_own_planner_and_keeps_trajectories(
