@@ -91,6 +91,15 @@ def _name(file: str) -> str:
     return Path(file).stem
 
 
+def _names(planners: str) -> list[str]:
+    return [name.strip() for name in planners.split(",") if name.strip()]
+
+
+def _json_list(values: Any) -> list[Any]:
+    """Values of a column; JSON has no NaN."""
+    return [None if value != value else value for value in values.tolist()]
+
+
 def _say(text: str, quiet: bool) -> None:
     if not quiet:
         print(text)
@@ -195,7 +204,7 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Fly planners on the same seeds and compare them: the paper's Table 1 for any problem."""
-    names = [name.strip() for name in planners.split(",") if name.strip()]
+    names = _names(planners)
     _campaign(_problem(file, settings), file, names, runs, seed, workers, out, data, quiet, as_json)
 
 
@@ -233,6 +242,63 @@ def montecarlo(
 
         rule = StoppingRule(until_width, until_upper)
     _campaign(problem, file, names, runs, seed, workers, out, data, quiet, as_json, ticks, rule)
+
+
+@app.command()
+def sweep(
+    file: File,
+    out: OutNeeded,
+    vary: Annotated[
+        list[str],
+        typer.Option("--vary", metavar="KEY=V1,V2", help="Values of a problem key. Repeatable: a grid."),
+    ],
+    planners: Annotated[
+        str | None, typer.Option(help="Planners, with commas (default: the problem's own).")
+    ] = None,
+    runs: Runs = 100,
+    seed: Seed = 0,
+    workers: Workers = None,
+    settings: Settings = None,
+    data: Data = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Fly a grid over problem keys: one table, one figure; repeat the command to go on where it stopped."""
+    from napf_mpc.sweep import grid_points, run_sweep
+
+    points = grid_points(file, vary, settings or ())
+    names = _names(points[0].problem.planner.kind if planners is None else planners)
+    total = len(points) * runs
+    with _progress(total, quiet or as_json) as tell:
+
+        def progress(done: int) -> None:
+            interrupts.raise_if_asked()
+            tell(done)
+            interrupts.when_stopped(
+                f"stopped: {done} of {total} runs are kept in {out}; repeat the command to go on"
+            )
+
+        columns = run_sweep(
+            points, names, runs, seed, out, name=_name(file), workers=_processes(workers),
+            data_folder=data, progress=progress,
+        )  # fmt: skip
+    from napf_mpc import store
+    from napf_mpc.plot.sweep import draw_sweep
+    from napf_mpc.report import sweep_table
+
+    keys = list(points[0].settings)
+    table = sweep_table(_name(file), keys, columns, seed)
+    store.write_bytes(out / "sweep.md", lambda file: file.write(table.markdown().encode()))
+    draw_sweep(columns, keys, out)
+    if as_json:
+        rows = [
+            dict(zip(columns, row, strict=True))
+            for row in zip(*map(_json_list, columns.values()), strict=True)
+        ]
+        _print_json({"problem": _name(file), "seed": seed, "points": rows})
+        return
+    _show(table, quiet)
+    _say(f"results and figure: {out}", quiet)
 
 
 @app.command()

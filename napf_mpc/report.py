@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -192,6 +193,40 @@ def _reference_note(reference: Reference) -> str:
         intervals.append(f"{name} {100 * rate.low:.1f}-{100 * rate.high:.1f} %")
     words = f"{reference.source}: its {reference.runs} runs alone allow {', '.join(intervals)} (95 % Wilson)."
     return shown_text(f"{words} {reference.note}".strip(), 2000)
+
+
+def sweep_table(name: str, keys: Sequence[str], columns: Mapping[str, Any], seed: int) -> Rows:
+    """Points of a sweep one under the other: risk with its interval, what finished, how far from the slots.
+
+    Parameters
+    ----------
+    name : str
+        What was flown.
+    keys : sequence of str
+        Keys that were varied.
+    columns : mapping of str to array
+        As :func:`napf_mpc.sweep.run_sweep` returns them.
+    seed : int
+        Campaign seed.
+    """
+    rows = []
+    for i, planner in enumerate(columns["planner"]):
+        value = {key: values[i].item() for key, values in columns.items()}
+        rows.append(
+            (
+                *(shown_text(str(value[key]), 60) for key in keys),
+                str(planner),
+                _rate(value, "collision_risk"),
+                f"{100 * value['finished']:.1f} %",
+                f"{value['path_rms_m']:.2f}" if math.isfinite(value["path_rms_m"]) else "not defined",
+            )
+        )
+    header = (*keys, "planner", "collision risk", "finished", "path RMS [m]")
+    notes = (
+        f"N = {columns['runs'][0]} runs a planner and point, all of seed {seed}: count / missions = rate "
+        "[95 % Wilson interval]; path RMS: median of the runs for which it is defined.",
+    )
+    return Rows(f"{shown_text(name, 200)}, by {', '.join(keys)}", header, tuple(rows), notes)
 
 
 def rare_table(summary: dict[str, Any]) -> Rows:

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent / "napf_mpc"
 FLOORS: list[set[str]] = [
     {"__main__"},
     {"cli"},
-    {"mission", "figures", "benchmark", "rare_events"},
+    {"mission", "figures", "benchmark", "rare_events", "sweep"},
     {"report", "plot"},
     {"campaign"},
     {"campaign_folder", "scenario_file", "workers"},

@@ -45,7 +45,7 @@ source = "A paper"
 runs = 30
 collision_risk = { apf = 0.7333, napf = 0.1667 }
 """
-COMMANDS = ["problems", "validate", "run", "compare", "montecarlo", "rare", "figures"]
+COMMANDS = ["problems", "validate", "run", "compare", "montecarlo", "rare", "sweep", "figures"]
 
 
 @pytest.fixture
@@ -180,11 +180,17 @@ def test_the_module_is_the_command() -> None:
         ("rare P --out O --planner no", '"no" is not a planner'),
         ("rare P", "Missing option '--out'"),
         ("rare single_uav --out O", "mission.kind"),
-        ("rare P --out O --set world.kind=empty --set world.count=1", "world"),
         ("montecarlo P --out O --cluster here", "No such option: --cluster"),
         ("run", "Missing argument"),
         ("run P P", "unexpected extra argument"),
-        ("sweep P", "No such command 'sweep'"),
+        ("sweep P --out O", "Missing option '--vary'"),
+        ("sweep P --vary planner.k=1,2", "Missing option '--out'"),
+        ("sweep P --vary planner.k --out O", "must be key.path=value,value,... for example planner.k=1,2,3"),
+        ("sweep P --vary planner.kk=1 --out O", "planner.kk: unknown key; did you mean planner.k?"),
+        ("sweep P --vary planner.k=2,99 --out O", "planner.k = 99: must be >= 0 and <= 20"),
+        ("sweep P --vary planner.k=2 --planners no --out O", '"no" is not a planner'),
+        ("sweep P --vary planner.k=2 --runs 0 --out O", "runs = 0"),
+        ("swep P", "No such command 'swep'. Did you mean 'sweep'?"),
         ("comapre P", "No such command 'comapre'. Did you mean 'compare'?"),
         ("run nishi_shinjuku --data D", "--data"),
     ],
