@@ -1,7 +1,8 @@
 """Sensitivity of the collision risk to what the paper does not print: the table in ``docs/sensitivity.md``.
 
-Every cell flies the same seeds. Run ``python benchmarks/sensitivity.py --runs 1000 --out out/sensitivity``;
-repeating the command goes on where it stopped.
+A sweep over scenes and planners; every cell flies the same seeds. Run
+``python benchmarks/sensitivity.py --runs 1000 --out out/sensitivity``; repeating the command goes on where it
+stopped.
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ import platform
 import time
 from pathlib import Path
 
-from napf_mpc.campaign import run_campaign, versions
+from napf_mpc.campaign import versions
 from napf_mpc.problem_file import load_problem
+from napf_mpc.sweep import Point, run_sweep
 
 SCENES: dict[str, tuple[str, list[str]]] = {
     "8 spheres (`table1_8`)": ("table1_8", []),
@@ -42,26 +44,31 @@ PLANNERS: dict[str, tuple[str, list[str]]] = {
 """What varies in the planner: label -> planner and its overrides."""
 
 
-def cell(scene: str, planner: str, runs: int, seed: int, out: Path, workers: int) -> str:
-    name, settings = SCENES[scene]
-    kind, own = PLANNERS[planner]
-    folder = out / "".join(c if c.isalnum() else "_" for c in f"{scene}-{planner}")
-    summary = run_campaign(
-        load_problem(name, [*settings, *own]), [kind], runs, seed, folder, name=name, workers=workers
-    )
-    result = summary["planners"][kind]
-    low, high = 100 * result["collision_risk_low"], 100 * result["collision_risk_high"]
-    unfinished = runs - round(result["finished"] * runs)
-    note = f", {unfinished} not finished" if unfinished else ""
-    return f"{100 * result['collision_risk']:.1f} [{low:.1f}-{high:.1f}]{note}"
+def rates(kind: str, runs: int, seed: int, out: Path, workers: int) -> dict[tuple[str, str], str]:
+    """Cells of the columns of one kind of planner, by scene and column."""
+    points = [
+        Point({"scene": scene, "column": column}, load_problem(name, [*settings, *own]))
+        for scene, (name, settings) in SCENES.items()
+        for column, (of_kind, own) in PLANNERS.items()
+        if of_kind == kind
+    ]
+    found = run_sweep(points, [kind], runs, seed, out / kind, name="sensitivity", workers=workers)
+    cells = {}
+    for i, point in enumerate(points):
+        rate, low, high = (100 * float(found[f"collision_risk{end}"][i]) for end in ("", "_low", "_high"))
+        unfinished = runs - round(float(found["finished"][i]) * runs)
+        note = f", {unfinished} not finished" if unfinished else ""
+        cells[point.settings["scene"], point.settings["column"]] = f"{rate:.1f} [{low:.1f}-{high:.1f}]{note}"
+    return cells
 
 
 def table(runs: int, seed: int, out: Path, workers: int) -> str:
+    cells: dict[tuple[str, str], str] = {}
+    for kind in dict.fromkeys(kind for kind, _ in PLANNERS.values()):
+        cells |= rates(kind, runs, seed, out, workers)
     lines = ["| scene and errors | " + " | ".join(PLANNERS) + " |", "|---|" + "---:|" * len(PLANNERS)]
     for scene in SCENES:
-        cells = [cell(scene, planner, runs, seed, out, workers) for planner in PLANNERS]
-        lines.append(f"| {scene} | " + " | ".join(cells) + " |")
-        print(lines[-1], flush=True)
+        lines.append(f"| {scene} | " + " | ".join(cells[scene, column] for column in PLANNERS) + " |")
     return "\n".join(lines)
 
 
@@ -74,6 +81,7 @@ def main() -> None:
     arguments = parser.parse_args()
     began = time.perf_counter()
     rows = table(arguments.runs, arguments.seed, arguments.out, arguments.workers)
+    print(rows)
     seconds = time.perf_counter() - began
     words = ", ".join(f"{name} {version}" for name, version in versions().items())
     text = (

@@ -200,9 +200,13 @@ def run_campaign(
                     prefix.add(chunk, kept.rows)
                     if prefix.answer is not None:
                         break
+        most = runs
         if prefix is not None and prefix.answer is not None:
             runs = prefix.answer
         summary = conclude(out, blocks, runs)
+        if prefix is not None:
+            summary["stopping"] = {"rule": str(enough), "met": prefix.answer is not None, "most_runs": most}
+            store.write_json(out / "summary.json", summary)
         write_scenario(out / "scenario.json", problem, seed, range(runs), data_folder)
     return summary
 

@@ -18,6 +18,7 @@ from napf_mpc.errors import NapfError, ProblemError
 if TYPE_CHECKING:
     from napf_mpc.problem import Problem
     from napf_mpc.report import Rows
+    from napf_mpc.stopping import StoppingRule
 
 T = TypeVar("T")
 
@@ -104,6 +105,15 @@ def _problem(file: str, settings: list[str] | None) -> Problem:
 
 def _name(file: str) -> str:
     return Path(file).stem
+
+
+def _names(planners: str) -> list[str]:
+    return [name.strip() for name in planners.split(",") if name.strip()]
+
+
+def _json_list(values: Any) -> list[Any]:
+    """Values of a column; JSON has no NaN."""
+    return [None if value != value else value for value in values.tolist()]
 
 
 def _say(text: str, quiet: bool) -> None:
@@ -212,7 +222,7 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Fly planners on the same seeds and compare them: the paper's Table 1 for any problem."""
-    names = [name.strip() for name in planners.split(",") if name.strip()]
+    names = _names(planners)
     engine = _engine(workers, cluster, block_limit)
     _campaign(_problem(file, settings), file, names, runs, seed, engine, out, data, quiet, as_json)
 
@@ -227,6 +237,14 @@ def montecarlo(
     workers: Workers = None,
     cluster: Cluster = None,
     block_limit: BlockLimit = None,
+    until_width: Annotated[
+        float | None,
+        typer.Option(help="Stop once the interval of the risk is narrower than this; --runs is the most."),
+    ] = None,
+    until_upper: Annotated[
+        float | None,
+        typer.Option(help="Stop once the upper end of that interval is below this; --runs is the most."),
+    ] = None,
     trajectories: Annotated[
         bool, typer.Option("--trajectories", help="Keep trajectories at the planner's rate.")
     ] = False,
@@ -240,7 +258,109 @@ def montecarlo(
     ticks = round(problem.simulation.controller_rate_hz / problem.planner.rate_hz) if trajectories else 0
     names = [problem.planner.kind if planner is None else planner]
     engine = _engine(workers, cluster, block_limit)
-    _campaign(problem, file, names, runs, seed, engine, out, data, quiet, as_json, ticks)
+    rule = None
+    if until_width is not None or until_upper is not None:
+        from napf_mpc.stopping import StoppingRule
+
+        rule = StoppingRule(until_width, until_upper)
+    _campaign(problem, file, names, runs, seed, engine, out, data, quiet, as_json, ticks, rule)
+
+
+@app.command()
+def sweep(
+    file: File,
+    out: OutNeeded,
+    vary: Annotated[
+        list[str],
+        typer.Option("--vary", metavar="KEY=V1,V2", help="Values of a problem key. Repeatable: a grid."),
+    ],
+    planners: Annotated[
+        str | None, typer.Option(help="Planners, with commas (default: the problem's own).")
+    ] = None,
+    runs: Runs = 100,
+    seed: Seed = 0,
+    workers: Workers = None,
+    settings: Settings = None,
+    data: Data = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Fly a grid over problem keys: one table, one figure; repeat the command to go on where it stopped."""
+    from napf_mpc.sweep import grid_points, run_sweep
+
+    points = grid_points(file, vary, settings or ())
+    names = _names(points[0].problem.planner.kind if planners is None else planners)
+    total = len(points) * runs
+    with _progress(total, quiet or as_json) as tell:
+
+        def progress(done: int) -> None:
+            interrupts.raise_if_asked()
+            tell(done)
+            interrupts.when_stopped(
+                f"stopped: {done} of {total} runs are kept in {out}; repeat the command to go on"
+            )
+
+        columns = run_sweep(
+            points, names, runs, seed, out, name=_name(file), workers=_processes(workers),
+            data_folder=data, progress=progress,
+        )  # fmt: skip
+    from napf_mpc import store
+    from napf_mpc.plot.sweep import draw_sweep
+    from napf_mpc.report import sweep_table
+
+    keys = list(points[0].settings)
+    table = sweep_table(_name(file), keys, columns, seed)
+    store.write_bytes(out / "sweep.md", lambda file: file.write(table.markdown().encode()))
+    draw_sweep(columns, keys, out)
+    if as_json:
+        rows = [
+            dict(zip(columns, row, strict=True))
+            for row in zip(*map(_json_list, columns.values()), strict=True)
+        ]
+        _print_json({"problem": _name(file), "seed": seed, "points": rows})
+        return
+    _show(table, quiet)
+    _say(f"results and figure: {out}", quiet)
+
+
+@app.command()
+def rare(
+    file: File,
+    out: OutNeeded,
+    planner: Planner = None,
+    samples: Annotated[int, typer.Option(help="Missions a level: 1000 for a risk to about a third.")] = 1000,
+    seed: Seed = 0,
+    settings: Settings = None,
+    data: Data = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Estimate a collision risk too small to count, by subset simulation; repeat the command to go on."""
+    problem = _problem(file, settings)
+    from napf_mpc.rare_events.estimate import check_samples, estimate_collision_risk
+
+    check_samples(samples)
+    with _progress(None, quiet or as_json) as tell:
+
+        def progress(done: int) -> None:
+            interrupts.raise_if_asked()
+            tell(done)
+            interrupts.when_stopped(
+                f"stopped: {done} missions are kept in {out}; repeat the command to go on"
+            )
+
+        summary = estimate_collision_risk(
+            problem, problem.planner.kind if planner is None else planner, out, samples=samples, seed=seed,
+            name=_name(file), data_folder=data, progress=progress,
+        )  # fmt: skip
+    from napf_mpc import store
+    from napf_mpc.report import rare_table
+
+    table = rare_table(summary)
+    store.write_bytes(out / "rare.md", lambda file: file.write(table.markdown().encode()))
+    if not as_json:
+        _show(table, quiet)
+    _end(summary, out, quiet, as_json)
 
 
 @app.command()
@@ -400,6 +520,7 @@ def _campaign(
     quiet: bool,
     as_json: bool,
     record_every: int = 0,
+    rule: StoppingRule | None = None,
 ) -> None:
     from contextlib import ExitStack
     from tempfile import TemporaryDirectory
@@ -420,7 +541,7 @@ def _campaign(
 
         summary = run_campaign(
             problem, names, runs, seed, kept, name=_name(file), data_folder=data,
-            record_every=record_every, progress=progress, warn=_warn, **engine,
+            record_every=record_every, progress=progress, warn=_warn, enough=rule, **engine,
         )  # fmt: skip
     from napf_mpc.report import comparison
 
@@ -437,8 +558,8 @@ def _campaign(
 
 
 @contextmanager
-def _progress(runs: int, silent: bool) -> Iterator[Callable[[int], None]]:
-    """Progress bar on a terminal, nothing anywhere else."""
+def _progress(runs: int | None, silent: bool) -> Iterator[Callable[[int], None]]:
+    """Progress bar on a terminal, nothing anywhere else; without a number of runs it has no end."""
     if silent or not sys.stderr.isatty():
         yield lambda done: None
         return

@@ -25,6 +25,7 @@ from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import MovingTracker
 from napf_mpc.planners.planner import Command, Planner
 from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.streams import Seed
 from napf_mpc.vehicle.lqr import check_sampled_loop
 from napf_mpc.vehicle.plant import advance, plain
 from napf_mpc.vehicle.quadrotor import parameters
@@ -46,7 +47,7 @@ LOST_M = 1e7
 class Scenario:
     """What chance decides for a block of runs; every planner of a comparison flies the same."""
 
-    seed: int
+    seed: Seed
     """Campaign seed."""
     runs: range
     """Indices of the runs in their campaign."""
@@ -90,7 +91,7 @@ def initial_state(problem: Problem) -> Array:
     return state
 
 
-def build_scenario(problem: Problem, seed: int, runs: range, data_folder: Path | None = None) -> Scenario:
+def build_scenario(problem: Problem, seed: Seed, runs: range, data_folder: Path | None = None) -> Scenario:
     """Draw obstacles, initial state and navigation errors of some runs of a campaign.
 
     Raises

@@ -91,7 +91,9 @@ def draw_comparison(
     DataError
         If they do not fly as they did, as with another version.
     """
-    written = plot.compare_figures(summary, rows, out, problem.reference, credit_of(problem))
+    written = plot.compare_figures(
+        _with_valid_ends(summary), rows, out, problem.reference, credit_of(problem)
+    )
     missions = plot.pick_missions(rows, SHOWN_EACH)
     tracks = []
     for mission in missions:
@@ -120,6 +122,18 @@ def draw_comparison(
 
     name, flown = str(summary["problem"]), store.stack(tracks)
     return written + plot.paths_overview(problem, name, flown, obstacles_of, missions, out, moving_in)
+
+
+def _with_valid_ends(summary: dict[str, Any]) -> dict[str, Any]:
+    """Put the sequential interval of the risk in place of Wilson's where the number of runs was not fixed."""
+    if "stopping" not in summary:
+        return summary
+    ends = {end: f"collision_risk_sequential_{end}" for end in ("low", "high")}
+    planners = {
+        name: part | {f"collision_risk_{end}": part[key] for end, key in ends.items()}
+        for name, part in summary["planners"].items()
+    }
+    return summary | {"planners": planners}
 
 
 def _planner_ticks(problem: Problem) -> int:

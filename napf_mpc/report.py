@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,7 +78,13 @@ def comparison(summary: dict[str, Any], reference: Reference | None = None) -> R
     planners: dict[str, dict[str, Any]] = summary["planners"]
     runs = next(iter(planners.values()))["runs"]
     each = planners.values()
+    stopping = summary.get("stopping")
     rows = [("collision risk, any UAV and obstacle", *[_rate(p, "collision_risk") for p in each])]
+    if stopping is not None:
+        rows = [
+            (rows[0][0] + ", sequential", *[_sequential(p) for p in each]),
+            ("  Wilson, not valid here: N was not fixed", *rows[0][1:]),
+        ]
     if reference is not None:
         published: dict[str, float] = dict(reference.collision_risk)  # type: ignore[arg-type]
         cells = []
@@ -101,6 +108,8 @@ def comparison(summary: dict[str, Any], reference: Reference | None = None) -> R
         "Metrics: median [5 %, 95 %] of the missions for which they are defined.",
         "joint success: reached, no contact of either kind, re-formed after the last obstacle.",
     ]
+    if stopping is not None:
+        notes.insert(1, _stopped(stopping, runs))
     notes += [f"{name}: {note}" for name, p in planners.items() for note in _solver_notes(p)]
     notes += [_pair(pair) for pair in summary["paired"]]
     if reference is not None:
@@ -131,6 +140,20 @@ def _solver_notes(planner: dict[str, Any]) -> list[str]:
 def _rate(planner: dict[str, Any], key: str, uavs: int = 1) -> str:
     missions = planner["runs"] * uavs
     return _counted(planner[key], missions, planner[f"{key}_low"], planner[f"{key}_high"])
+
+
+def _sequential(planner: dict[str, Any]) -> str:
+    ends = (planner[f"collision_risk_sequential_{end}"] for end in ("low", "high"))
+    return _counted(planner["collision_risk"], planner["runs"], *ends)
+
+
+def _stopped(stopping: dict[str, Any], runs: int) -> str:
+    most = stopping["most_runs"]
+    how = f"met after {runs} of at most {most} runs" if stopping["met"] else f"not met in {most} runs"
+    return (
+        f"Stopping rule {stopping['rule']}: {how}. The sequential interval holds at whatever run a campaign "
+        "stops; all other intervals here are of a fixed N and a little too narrow."
+    )
 
 
 def _fraction(value: float, runs: int) -> str:
@@ -171,6 +194,73 @@ def _reference_note(reference: Reference) -> str:
         intervals.append(f"{name} {100 * rate.low:.1f}-{100 * rate.high:.1f} %")
     words = f"{reference.source}: its {reference.runs} runs alone allow {', '.join(intervals)} (95 % Wilson)."
     return shown_text(f"{words} {reference.note}".strip(), 2000)
+
+
+def sweep_table(name: str, keys: Sequence[str], columns: Mapping[str, Any], seed: int) -> Rows:
+    """Points of a sweep one under the other: risk with its interval, what finished, how far from the slots.
+
+    Parameters
+    ----------
+    name : str
+        What was flown.
+    keys : sequence of str
+        Keys that were varied.
+    columns : mapping of str to array
+        As :func:`napf_mpc.sweep.run_sweep` returns them.
+    seed : int
+        Campaign seed.
+    """
+    rows = []
+    for i, planner in enumerate(columns["planner"]):
+        value = {key: values[i].item() for key, values in columns.items()}
+        rows.append(
+            (
+                *(shown_text(str(value[key]), 60) for key in keys),
+                str(planner),
+                _rate(value, "collision_risk"),
+                f"{100 * value['finished']:.1f} %",
+                f"{value['path_rms_m']:.2f}" if math.isfinite(value["path_rms_m"]) else "not defined",
+            )
+        )
+    header = (*keys, "planner", "collision risk", "finished", "path RMS [m]")
+    notes = (
+        f"N = {columns['runs'][0]} runs a planner and point, all of seed {seed}: count / missions = rate "
+        "[95 % Wilson interval]; path RMS: median of the runs for which it is defined.",
+    )
+    return Rows(f"{shown_text(name, 200)}, by {', '.join(keys)}", header, tuple(rows), notes)
+
+
+def rare_table(summary: dict[str, Any]) -> Rows:
+    """Estimate of a small collision risk, and the levels it is made of."""
+    levels = summary["levels"]
+    if summary["reached"]:
+        ends = f"[{summary['collision_risk_low']:.2g}, {summary['collision_risk_high']:.2g}]"
+        cells = [("collision risk, any UAV and obstacle", f"{summary['collision_risk']:.2e} {ends}")]
+        cells.append(("  coefficient of variation, levels independent", f"{summary['cov']:.2f}"))
+        cells.append(("  the same, all levels erring together", f"{summary['cov_bound']:.2f}"))
+        risk, cov = summary["collision_risk"], summary["cov"]
+        if cov:
+            cells.append(("missions that counting would take for it", f"{(1 - risk) / (risk * cov**2):,.0f}"))
+    else:
+        cells = [("collision risk, any UAV and obstacle", f"not reached; below about {summary['below']:.0e}")]
+    cells.append(("missions flown", f"{summary['calls']:,}"))
+    cells.append(("  of them failed, counted as contacts", f"{summary['failed']:,}"))
+    for number, level in enumerate(levels, 1):
+        taken = "" if level["accepted"] is None else f", {100 * level['accepted']:.0f} % of steps taken"
+        cells.append(
+            (
+                f"level {number}: clearance <= {level['threshold']:.3f} m",
+                f"{100 * level['probability']:.1f} %{taken}",
+            )
+        )
+    notes = (
+        f"Subset simulation, {summary['samples']} missions a level, {summary['dimension']} random numbers a "
+        f"mission, seed {summary['seed']}.",
+        "Interval: 95 %, log-normal, as if all levels erred together. It does not know of a way to collide "
+        "that no mission came near: compare several seeds.",
+    )
+    title = f"{shown_text(summary['problem'], 200)}, planner {summary['planner']}"
+    return Rows(title, ("", "value"), tuple(cells), notes)
 
 
 def mission_table(row: dict[str, Any], name: str) -> Rows:

@@ -7,6 +7,7 @@ change with the total, and no result depends on which worker or block drew it.
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,26 +28,41 @@ class Stream(IntEnum):
     ACCELEROMETER_NOISE = 9
     MOVING_ACCELERATION = 10
     MOVING_OBSERVATION = 11
+    RARE_EVENT = 12
 
 
-def generator(seed: int, run: int, stream: Stream, uav: int = 0, axis: int = 0) -> np.random.Generator:
+class Numbers(Protocol):
+    """Random numbers of one's own, that may stand wherever a campaign seed does."""
+
+    def generator(self, run: int, stream: Stream, uav: int, axis: int) -> np.random.Generator:
+        """Return the generator of one stream."""
+        ...
+
+
+Seed = int | Numbers
+"""A campaign seed, or numbers of one's own, as a method for rare events has them."""
+
+
+def generator(seed: Seed, run: int, stream: Stream, uav: int = 0, axis: int = 0) -> np.random.Generator:
     """Return the generator of one stream: ``SeedSequence(seed, spawn_key=(run, stream, uav, axis))``.
 
     Parameters
     ----------
-    seed : int
-        Campaign seed, 0 <= seed < 2**63.
+    seed : int or Numbers
+        Campaign seed, 0 <= seed < 2**63, or what stands for it.
     run, uav, axis : int
         Indices from zero; streams of moving obstacles count those instead of UAVs.
     stream : Stream
         What the numbers are for.
     """
+    if not isinstance(seed, (int, np.integer)):
+        return seed.generator(run, stream, uav, axis)
     return np.random.Generator(
         np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(run, int(stream), uav, axis)))
     )
 
 
-def normals(seed: int, runs: range, stream: Stream, uavs: int, axes: int, count: int) -> NDArray[np.float64]:
+def normals(seed: Seed, runs: range, stream: Stream, uavs: int, axes: int, count: int) -> NDArray[np.float64]:
     """Draw standard-normal arrays, shape (run, uav, axis, count), each series from its own generator."""
     out = np.empty((len(runs), uavs, axes, count))
     for r, run in enumerate(runs):
@@ -56,7 +72,9 @@ def normals(seed: int, runs: range, stream: Stream, uavs: int, axes: int, count:
     return out
 
 
-def uniforms(seed: int, runs: range, stream: Stream, uavs: int, axes: int, count: int) -> NDArray[np.float64]:
+def uniforms(
+    seed: Seed, runs: range, stream: Stream, uavs: int, axes: int, count: int
+) -> NDArray[np.float64]:
     """Draw uniform arrays on [0, 1), shape (run, uav, axis, count), each series from its own generator."""
     out = np.empty((len(runs), uavs, axes, count))
     for r, run in enumerate(runs):
@@ -74,8 +92,8 @@ class NormalSequence:
 
     Parameters
     ----------
-    seed : int
-        Campaign seed.
+    seed : int or Numbers
+        Campaign seed, or what stands for it.
     runs : range
         Indices of the runs.
     stream : Stream
@@ -87,7 +105,7 @@ class NormalSequence:
     """
 
     def __init__(
-        self, seed: int, runs: range, stream: Stream, uavs: int, axes: int = 3, ahead: int = 256
+        self, seed: Seed, runs: range, stream: Stream, uavs: int, axes: int = 3, ahead: int = 256
     ) -> None:
         self._generators = [
             generator(seed, run, stream, uav, axis)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from napf_mpc.evaluate import METRICS, Outcome
 from napf_mpc.planners.tally import COLUMNS, COUNTED, FALL_BACKS
 from napf_mpc.risk import Rate, clustered_rate, paired_tests, quantiles, wilson
+from napf_mpc.stopping import sequential_interval
 
 Columns = dict[str, NDArray[Any]]
 
@@ -44,13 +45,16 @@ def summarise(rows: Columns, identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _planner_summary(part: Columns) -> dict[str, Any]:
-    runs = len(part["run"])
+    runs, contacts = len(part["run"]), int(part["obstacle_contact"].sum())
+    low, high = sequential_interval(contacts, runs)
     outcomes = {str(outcome): int((part["outcome"] == str(outcome)).sum()) for outcome in Outcome}
     return {
         "runs": runs,
         "uavs": int(part["uavs"][0]),
         **outcomes,
-        **_bounds("collision_risk", wilson(int(part["obstacle_contact"].sum()), runs)),
+        **_bounds("collision_risk", wilson(contacts, runs)),
+        "collision_risk_sequential_low": low,
+        "collision_risk_sequential_high": high,
         **_bounds("uav_collision_risk", clustered_rate(part["uavs_hit"], int(part["uavs"][0]))),
         **_bounds("uav_contact_risk", wilson(int(part["uav_contact"].sum()), runs)),
         "finished": int(part["finished"].sum()) / runs,

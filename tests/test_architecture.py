@@ -16,7 +16,7 @@ ROOT = Path(__file__).parent.parent / "napf_mpc"
 FLOORS: list[set[str]] = [
     {"__main__"},
     {"cli"},
-    {"mission", "figures", "benchmark"},
+    {"mission", "figures", "benchmark", "rare_events", "sweep"},
     {"report", "plot"},
     {"campaign"},
     {"prefix"},
@@ -41,7 +41,7 @@ FLOORS: list[set[str]] = [
     {"problem_file"},
     {"problem_faults"},
     {"problem"},
-    {"store", "data_folder", "overrides"},
+    {"store", "data_folder", "overrides", "stopping"},
     {"risk", "first_passage", "shipped", "interrupts", "streams", "jit", "errors", "words"},
 ]
 

@@ -470,6 +470,8 @@ def test_the_summary_keeps_its_contract(hundred: Path) -> None:
         assert sum(planner[str(outcome)] for outcome in Outcome) == 100
         assert planner["collision_risk"] == hits / 100
         assert 0.0 <= planner["collision_risk_low"] < hits / 100 < planner["collision_risk_high"] <= 1.0
+        assert planner["collision_risk_sequential_low"] < planner["collision_risk_low"]
+        assert planner["collision_risk_high"] < planner["collision_risk_sequential_high"]
         assert planner["uav_collision_risk"] == mine["uavs_hit"].sum() / 400
         assert planner["uav_collision_risk_low"] < planner["uav_collision_risk_high"]
         assert planner["finished"] == mine["finished"].mean()

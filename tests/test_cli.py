@@ -45,7 +45,7 @@ source = "A paper"
 runs = 30
 collision_risk = { apf = 0.7333, napf = 0.1667 }
 """
-COMMANDS = ["problems", "validate", "run", "compare", "montecarlo", "figures"]
+COMMANDS = ["problems", "validate", "run", "compare", "montecarlo", "rare", "sweep", "figures"]
 
 
 @pytest.fixture
@@ -175,9 +175,26 @@ def test_the_module_is_the_command() -> None:
         ("figures nonsense --out O", "no such file"),
         ("figures . --out O --set planner.k=2", "is drawn as it was flown"),
         ("montecarlo P", "Missing option '--out'"),
+        ("montecarlo P --out O --until-width 0", "until-width = 0: must be a rate above 0 and below 1"),
+        ("montecarlo P --out O --until-upper 2", "until-upper = 2: must be a rate above 0 and below 1"),
+        ("montecarlo P --out O --until-upper nan", "until-upper = nan: must be a rate"),
+        ("montecarlo P --out O --until-upper x", "Invalid value for '--until-upper'"),
+        ("rare P --out O --samples 15", "samples = 15: must be a multiple of 10 from 20 to 1000000"),
+        ("rare P --out O --samples 0", "samples = 0"),
+        ("rare P --out O --seed -1", "seed = -1"),
+        ("rare P --out O --planner no", '"no" is not a planner'),
+        ("rare P", "Missing option '--out'"),
+        ("rare single_uav --out O", "mission.kind"),
         ("run", "Missing argument"),
         ("run P P", "unexpected extra argument"),
-        ("sweep P", "No such command 'sweep'"),
+        ("sweep P --out O", "Missing option '--vary'"),
+        ("sweep P --vary planner.k=1,2", "Missing option '--out'"),
+        ("sweep P --vary planner.k --out O", "must be key.path=value,value,... for example planner.k=1,2,3"),
+        ("sweep P --vary planner.kk=1 --out O", "planner.kk: unknown key; did you mean planner.k?"),
+        ("sweep P --vary planner.k=2,99 --out O", "planner.k = 99: must be >= 0 and <= 20"),
+        ("sweep P --vary planner.k=2 --planners no --out O", '"no" is not a planner'),
+        ("sweep P --vary planner.k=2 --runs 0 --out O", "runs = 0"),
+        ("swep P", "No such command 'swep'. Did you mean 'sweep'?"),
         ("comapre P", "No such command 'comapre'. Did you mean 'compare'?"),
         ("run nishi_shinjuku --data D", "--data"),
     ],
@@ -447,6 +464,40 @@ def test_montecarlo_goes_on_where_it_stopped(
     assert done(capsys, *words, "--runs", "11", "--out", tmp_path / "b") == (0, "", "")
     assert digest(tmp_path / "a") == digest(tmp_path / "b")
     assert set(first) < set((tmp_path / "a" / "blocks").iterdir())
+
+
+def test_montecarlo_stops_when_enough_is_known(
+    problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    words = ["montecarlo", problem, "--planner", "apf", "--seed", "2", "--workers", "1", "--out", out]
+    code, text, err = done(capsys, *words, "--runs", "60", "--until-width", "0.6", "--until-upper", "0.001")
+    assert (code, err) == (0, "")
+    assert "Stopping rule until-width 0.6 or until-upper 0.001: met after" in text
+    runs = len(store.read_table(out / "runs.parquet")["run"])
+    assert runs < 30
+    assert f"met after {runs} of at most 60 runs" in (out / "comparison.md").read_text()
+    # The same folder serves a rule that asks for more, and a fixed number of runs.
+    assert done(capsys, *words, "--runs", "60", "--until-width", "0.5", "--quiet")[0] == 0
+    assert runs < len(store.read_table(out / "runs.parquet")["run"]) < 60
+    assert done(capsys, *words, "--runs", "60", "--quiet")[0] == 0
+    assert "stopping" not in json.loads((out / "summary.json").read_text())
+
+
+def test_rare_estimates_and_goes_on(problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    words = ["rare", problem, "--planner", "apf", "--samples", "40", "--seed", "3", "--out", out]
+    code, text, err = done(capsys, *words)
+    assert (code, err) == (0, "")
+    assert "collision risk, any UAV and obstacle" in text
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["method"] == "subset simulation"
+    assert len(store.read_table(out / "calls.parquet")["clearance_m"]) == summary["calls"]
+    assert "| level 1: clearance <= " in (out / "rare.md").read_text()
+    assert json.loads(done(capsys, *words, "--json")[1]) == summary
+    code, _, err = done(capsys, *[word if word != "3" else "4" for word in words])
+    assert (code, err.count("\n")) == (2, 1)
+    assert "seed = 3, not 4" in err
 
 
 def test_montecarlo_flies_the_problems_own_planner_and_keeps_trajectories(

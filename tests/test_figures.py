@@ -68,6 +68,18 @@ def test_a_campaign_is_drawn_with_missions_that_went_well_and_badly(campaign: Pa
     assert all(path.stat().st_size > 1000 for path in written)
 
 
+def test_a_campaign_that_stopped_by_a_rule_is_drawn_with_the_interval_that_holds(
+    campaign: Path, tmp_path: Path, asked: dict[str, tuple[Any, ...]]
+) -> None:
+    rows, summary = store.read_table(campaign / "runs.parquet"), store.read_json(campaign / "summary.json")
+    draw_comparison(brief(), summary, rows, tmp_path)
+    assert asked["compare_figures"][0] == summary
+    draw_comparison(brief(), summary | {"stopping": {}}, rows, tmp_path)
+    for name, part in asked["compare_figures"][0]["planners"].items():
+        assert part["collision_risk_high"] == summary["planners"][name]["collision_risk_sequential_high"]
+        assert part["collision_risk_low"] == summary["planners"][name]["collision_risk_sequential_low"]
+
+
 def test_a_mission_is_drawn_from_its_folder(mission: Path, tmp_path: Path) -> None:
     written = draw_stored(mission, tmp_path)
     assert {"brief_napf_paths.png", "brief_napf_uncertainty.svg", "brief_napf_space.png"} <= {

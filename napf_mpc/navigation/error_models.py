@@ -21,7 +21,7 @@ from napf_mpc.navigation.processes import (
 )
 from napf_mpc.navigation.replay import RecordedErrors, recorded_errors
 from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Recorded
-from napf_mpc.streams import Stream, normals, uniforms
+from napf_mpc.streams import Seed, Stream, normals, uniforms
 
 __all__ = [
     "ConstantErrors",
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 
 def position_errors(
     navigation: Navigation,
-    seed: int,
+    seed: Seed,
     runs: range,
     uav_count: int,
     duration_s: float,
@@ -51,8 +51,8 @@ def position_errors(
     ----------
     navigation : Navigation
         Which errors.
-    seed : int
-        Campaign seed.
+    seed : int or Numbers
+        Campaign seed, or what stands for it.
     runs : range
         Runs of the block. What a run draws depends on its index and the seed alone.
     uav_count : int
@@ -170,7 +170,7 @@ def gauss_markov_errors(
 
 
 def _draw_gauss_markov(
-    config: GaussMarkov, seed: int, runs: range, uav_count: int, epochs: int
+    config: GaussMarkov, seed: Seed, runs: range, uav_count: int, epochs: int
 ) -> GaussMarkovErrors:
     own, common = _draw_units(config.common_mode_share, seed, runs, uav_count, epochs)
     phase_share = uniforms(seed, runs, Stream.SIGMA_PHASE, uav_count, 3, 1)[..., 0]
@@ -181,7 +181,7 @@ def _draw_gauss_markov(
 
 
 def _draw_availability(
-    config: GaussMarkov, seed: int, runs: range, uav_count: int, epochs: int
+    config: GaussMarkov, seed: Seed, runs: range, uav_count: int, epochs: int
 ) -> NDArray[np.bool_]:
     interval_s, length_s = config.outage_interval_s, config.outage_duration_s
     period_s = 1.0 / config.rate_hz
@@ -262,7 +262,7 @@ def constant_errors(
 # ---------------------------------------------------------------------------------------------- shared
 
 
-def _draw_units(share: float, seed: int, runs: range, uav_count: int, count: int) -> tuple[Array, Array]:
+def _draw_units(share: float, seed: Seed, runs: range, uav_count: int, count: int) -> tuple[Array, Array]:
     """Own (run, uav, 3, count) and common (run, 1, 3, count) standard-normal numbers."""
     own = normals(seed, runs, Stream.OWN_ERROR, uav_count, 3, count)
     if share == 0.0:  # it would be multiplied by zero

@@ -13,6 +13,7 @@ from napf_mpc.navigation.replay import RecordedErrors
 from napf_mpc.navigation.sensors import Sensors
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import Navigation
+from napf_mpc.streams import Seed
 
 __all__ = ["FilteredNavigation"]
 
@@ -29,8 +30,8 @@ class FilteredNavigation:
         Sensors and filter.
     errors : PositionErrors
         Of the position fixes.
-    seed : int
-        Campaign seed.
+    seed : int or Numbers
+        Campaign seed, or what stands for it.
     runs : range
         Runs of the block.
     period_s : float
@@ -45,7 +46,7 @@ class FilteredNavigation:
         self,
         navigation: Navigation,
         errors: PositionErrors,
-        seed: int,
+        seed: Seed,
         runs: range,
         period_s: float,
         ticks_per_fix: int,

@@ -21,7 +21,7 @@ from napf_mpc.navigation.recorded import (
     sample_period,
 )
 from napf_mpc.problem import Recorded
-from napf_mpc.streams import Stream, normals, uniforms
+from napf_mpc.streams import Seed, Stream, normals, uniforms
 
 __all__ = ["RecordedErrors", "load_error_log", "recorded_errors", "replay"]
 
@@ -53,7 +53,7 @@ def load_error_log(config: Recorded, data_folder: Path | None) -> ErrorLog:
 
 
 def recorded_errors(
-    config: Recorded, seed: int, runs: range, uav_count: int, epochs: int, data_folder: Path | None
+    config: Recorded, seed: Seed, runs: range, uav_count: int, epochs: int, data_folder: Path | None
 ) -> RecordedErrors:
     """Draw where each run and UAV starts in the log, and the barometers' errors."""
     log = load_error_log(config, data_folder)

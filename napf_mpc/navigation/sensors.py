@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
 from napf_mpc.problem import Navigation
-from napf_mpc.streams import NormalSequence, Stream
+from napf_mpc.streams import NormalSequence, Seed, Stream
 from napf_mpc.vehicle.plant import plain
 
 __all__ = ["Sensors", "bias_memory"]
@@ -38,8 +38,8 @@ class Sensors:
     ----------
     navigation : Navigation
         Sigmas and times.
-    seed : int
-        Campaign seed.
+    seed : int or Numbers
+        Campaign seed, or what stands for it.
     runs : range
         Runs of the block.
     uavs : int
@@ -51,7 +51,7 @@ class Sensors:
     """
 
     def __init__(
-        self, navigation: Navigation, seed: int, runs: range, uavs: int, period_s: float, velocity: Array
+        self, navigation: Navigation, seed: Seed, runs: range, uavs: int, period_s: float, velocity: Array
     ) -> None:
         scale = navigation.error_scale
         self._period_s = period_s

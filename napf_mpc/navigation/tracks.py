@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.problem import World
-from napf_mpc.streams import NormalSequence, Stream
+from napf_mpc.streams import NormalSequence, Seed, Stream
 from napf_mpc.world.moving import HOLD_S, MovingObstacles, round_distance
 
 Array = NDArray[np.float64]
@@ -129,8 +129,8 @@ class MovingTracker:
         Noise and rate of the observations, and the acceleration that is assumed.
     moving : MovingObstacles
         The truth that is observed.
-    seed : int
-        Campaign seed.
+    seed : int or Numbers
+        Campaign seed, or what stands for it.
     runs : range
         Indices of the runs in their campaign.
     period_s : float
@@ -138,7 +138,7 @@ class MovingTracker:
     """
 
     def __init__(
-        self, world: World, moving: MovingObstacles, seed: int, runs: range, period_s: float
+        self, world: World, moving: MovingObstacles, seed: Seed, runs: range, period_s: float
     ) -> None:
         self._moving = moving
         self._period_s = period_s

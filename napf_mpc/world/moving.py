@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.problem import MovingSphere, World
-from napf_mpc.streams import Stream, generator
+from napf_mpc.streams import Seed, Stream, generator
 from napf_mpc.world.distance import TOUCH_M
 
 Array = NDArray[np.float64]
@@ -82,15 +82,15 @@ class MovingObstacles:
         )
 
 
-def moving_obstacles(world: World, seed: int, runs: range, duration_s: float) -> MovingObstacles | None:
+def moving_obstacles(world: World, seed: Seed, runs: range, duration_s: float) -> MovingObstacles | None:
     """Moving obstacles of some runs of a campaign; None in a world without any.
 
     Parameters
     ----------
     world : World
         The problem's world.
-    seed : int
-        Campaign seed.
+    seed : int or Numbers
+        Campaign seed, or what stands for it.
     runs : range
         Indices of the runs. Accelerations depend on the seed, the run and the obstacle's index only.
     duration_s : float

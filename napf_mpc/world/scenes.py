@@ -33,7 +33,7 @@ from napf_mpc.problem import (
     StreetCanyon,
     World,
 )
-from napf_mpc.streams import Stream, generator
+from napf_mpc.streams import Seed, Stream, generator
 from napf_mpc.world.apart import MAX_TRIES, ApartRules, place_apart
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
@@ -51,7 +51,7 @@ def build_scenes(
     world: World,
     frame: PathFrame,
     lateral_lanes: Array,
-    seed: int,
+    seed: Seed,
     runs: range,
     data_folder: Path | None = None,
 ) -> ObstacleSet:
@@ -65,8 +65,8 @@ def build_scenes(
         Frame of the path; random scenes are placed in it, listed obstacles and cities are not.
     lateral_lanes : array, shape (uav,)
         Lateral place of each UAV of the formation [m], for ``lanes``.
-    seed : int
-        Campaign seed.
+    seed : int or Numbers
+        Campaign seed, or what stands for it.
     runs : range
         Indices of the runs. A scene depends on the seed and its run's index only.
     data_folder : Path, optional
@@ -223,7 +223,7 @@ def masts_from_uniforms(world: StreetCanyon, u: Array) -> Array:
     return np.stack([_between(world.along_range_m, u[:, 0]), lateral, radius, height], axis=-1)
 
 
-def _street(world: StreetCanyon, frame: PathFrame, seed: int, run: int) -> ObstacleSet:
+def _street(world: StreetCanyon, frame: PathFrame, seed: Seed, run: int) -> ObstacleSet:
     length = world.along_range_m[1] - world.along_range_m[0]
     shortest = world.building_length_m[0]
     if length < shortest:
@@ -259,7 +259,7 @@ def _street(world: StreetCanyon, frame: PathFrame, seed: int, run: int) -> Obsta
     return ObstacleSet.from_shapes(shapes)
 
 
-def _draw_apart(rules: ApartRules, seed: int, runs: range) -> Array:
+def _draw_apart(rules: ApartRules, seed: Seed, runs: range) -> Array:
     """Place the obstacles of each run, shape (run, count, 4), or say what is asked too much."""
     _check_size(rules.count, runs)
     way_out = (
