@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from napf_mpc import store
 from napf_mpc.campaign import run_campaign
 from napf_mpc.errors import ProblemError
+from napf_mpc.prefix import looks
 from napf_mpc.problem_file import load_problem
 from napf_mpc.report import comparison
 from napf_mpc.risk import wilson
@@ -138,20 +139,22 @@ def digest(out: Path) -> str:
 
 
 def test_a_campaign_stops_at_the_same_run_whatever_blocks_and_workers(tmp_path: Path) -> None:
-    rule = StoppingRule(width=0.5)
-    summary = fly(tmp_path / "a", 60, rule, block_runs=1)
+    rule, most = StoppingRule(width=0.27), 200
+    summary = fly(tmp_path / "a", most, rule, block_runs=10)
     runs = summary["planners"]["apf"]["runs"]
-    assert 5 < runs < 40
+    assert 50 < runs < most
     contact = store.read_table(tmp_path / "a" / "runs.parquet")["obstacle_contact"]
-    met = [rule.met(int(contact[:n].sum()), n) for n in range(1, runs + 1)]
-    assert met == [False] * (runs - 1) + [True]
-    fly(tmp_path / "b", 60, rule, block_runs=25)
-    fly(tmp_path / "c", 60, rule, block_runs=4, workers=2)
-    fly(tmp_path / "d", 3, None)
-    fly(tmp_path / "d", 60, rule, block_runs=7)  # goes on
-    fly(tmp_path / "e", 60, None)
+    asked = [n for n in looks(most) if n <= runs]
+    met = [rule.met(int(contact[:n].sum()), n) for n in asked]
+    assert asked[-1] == runs
+    assert met == [False] * (len(asked) - 1) + [True]
+    fly(tmp_path / "b", most, rule, block_runs=64)
+    fly(tmp_path / "c", most, rule, block_runs=16, workers=2)
+    fly(tmp_path / "d", 30, None)
+    fly(tmp_path / "d", most, rule, block_runs=70)  # goes on
+    fly(tmp_path / "e", most, None)
     flown = sorted((tmp_path / "e" / "blocks").iterdir())
-    fly(tmp_path / "e", 60, rule)  # has flown enough already
+    fly(tmp_path / "e", most, rule)  # has flown enough already
     assert sorted((tmp_path / "e" / "blocks").iterdir()) == flown
     assert len({digest(tmp_path / name) for name in "abcde"}) == 1
     scenario = json.loads((tmp_path / "b" / "scenario.json").read_text())
