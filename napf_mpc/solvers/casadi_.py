@@ -34,8 +34,8 @@ from napf_mpc.solvers.solver import Answer, MakeBackend, SolverError, Warm
 from napf_mpc.solvers.stagewise import Stages, single_stage, stagewise
 
 DEFAULTS: dict[str, dict[str, Any]] = {
-    # Its own limit is 10,000 iterations: more than an hour in a program that it cannot solve, and no signal
-    # is answered before.
+    # Its own limit is 10,000 iterations. In a program that it cannot solve one may take half a second, and no
+    # signal is answered before the last.
     "proxqp": {"eps_abs": 1e-9, "eps_rel": 0.0, "max_iter": 100, "verbose": False},
     # Sparse products; its factors are dense all the same.
     "qpoases": {"printLevel": "none", "sparse": True},
