@@ -1,7 +1,9 @@
 """Subset simulation against limit states with known answers, and against counting on a mission.
 
-Run ``python benchmarks/rare_events.py known`` (a minute) and
-``python benchmarks/rare_events.py mission --out out/rare`` (an hour); the tables of ``docs/statistics.md``.
+Run ``python benchmarks/rare_events.py known`` and
+``python benchmarks/rare_events.py mission --out out/rare``, some minutes each; the tables of
+``docs/statistics.md``. Whole flights take longer:
+``python benchmarks/rare_events.py mission --set planner.k=3 --runs 3000 --out out/whole``.
 """
 
 from __future__ import annotations
@@ -24,6 +26,19 @@ from napf_mpc.rare_events.subset import LimitState, SubsetResult, subset_simulat
 from napf_mpc.risk import wilson
 
 Array = NDArray[np.float64]
+
+SHORT = [
+    "mission={length_m = 1.0, initial_velocities_mps = [[2.0,0,0], [2.0,0,0], [2.0,0,0], [2.0,0,0]]}",
+    "world.count=1",
+    "world.along_range_m=[9.0,12.0]",
+    "world.radius_m=[0.3,0.6]",
+    "simulation.time_limit_s=5.0",
+    "simulation.controller_rate_hz=25.0",
+    "planner.rate_hz=5.0",
+    "planner.k=2",
+    "navigation.rate_hz=5.0",
+]
+"""Settings that make table1_8 a flight of five seconds past one small ball, cheap enough to be counted."""
 
 
 def along(dimension: int) -> Array:
@@ -122,7 +137,7 @@ def mission(name: str, settings: list[str], runs: int, seeds: int, samples: int,
         ends = f"{found['collision_risk_low']:.2e} to {found['collision_risk_high']:.2e}"
         line = f"{found['collision_risk']:.2e} (cov {found['cov']:.2f}) | {ends} | {found['calls']:,}"
         print(f"| subset simulation, seed {seed} | {line} |", flush=True)
-    print(f"\n{name} {' '.join(settings)}, planner napf.")
+    print(f"\n{name} with {', '.join(settings)}; planner napf, {samples} missions a level.")
 
 
 def main() -> None:
@@ -130,7 +145,7 @@ def main() -> None:
     parser.add_argument("what", choices=("known", "mission"))
     parser.add_argument("--problem", default="table1_8")
     parser.add_argument("--set", dest="settings", action="append", default=[])
-    parser.add_argument("--runs", type=int, default=3000)
+    parser.add_argument("--runs", type=int, default=10_000)
     parser.add_argument("--seeds", type=int)
     parser.add_argument("--samples", type=int)
     parser.add_argument("--out", type=Path, default=Path("out/rare"))
@@ -138,8 +153,8 @@ def main() -> None:
     if given.what == "known":
         known(given.seeds or 100, given.samples or 1500)
     else:
-        settings = given.settings or ["planner.k=3"]
-        mission(given.problem, settings, given.runs, given.seeds or 3, given.samples or 500, given.out)
+        settings = given.settings or SHORT
+        mission(given.problem, settings, given.runs, given.seeds or 5, given.samples or 500, given.out)
 
 
 if __name__ == "__main__":

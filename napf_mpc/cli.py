@@ -305,13 +305,14 @@ def sweep(
             data_folder=data, progress=progress,
         )  # fmt: skip
     from napf_mpc import store
+    from napf_mpc.plot.style import credit_of
     from napf_mpc.plot.sweep import draw_sweep
     from napf_mpc.report import sweep_table
 
     keys = list(points[0].settings)
     table = sweep_table(_name(file), keys, columns, seed)
     store.write_bytes(out / "sweep.md", lambda file: file.write(table.markdown().encode()))
-    draw_sweep(columns, keys, out)
+    draw_sweep(columns, keys, out, credit_of(points[0].problem))
     if as_json:
         rows = [
             dict(zip(columns, row, strict=True))
@@ -328,7 +329,9 @@ def rare(
     file: File,
     out: OutNeeded,
     planner: Planner = None,
-    samples: Annotated[int, typer.Option(help="Missions a level: 1000 for a risk to about a third.")] = 1000,
+    samples: Annotated[
+        int, typer.Option(help="Missions a level; the more, the surer. Compare several seeds.")
+    ] = 1000,
     seed: Seed = 0,
     settings: Settings = None,
     data: Data = None,

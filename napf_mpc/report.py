@@ -256,8 +256,8 @@ def rare_table(summary: dict[str, Any]) -> Rows:
     notes = (
         f"Subset simulation, {summary['samples']} missions a level, {summary['dimension']} random numbers a "
         f"mission, seed {summary['seed']}.",
-        "Interval: 95 %, log-normal, as if all levels erred together. It does not know of a way to collide "
-        "that no mission came near: compare several seeds.",
+        "Interval: 95 %, log-normal, as if all levels erred together. Missions can spread by more, and it "
+        "does not know of a way to collide that no mission came near: compare several seeds.",
     )
     title = f"{shown_text(summary['problem'], 200)}, planner {summary['planner']}"
     return Rows(title, ("", "value"), tuple(cells), notes)

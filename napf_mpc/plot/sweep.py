@@ -35,7 +35,7 @@ WIDE_RANGE = 30.0
 """Ratio of the largest to the smallest value from which an axis is logarithmic."""
 
 
-def sweep_figure(columns: Mapping[str, NDArray[Any]], keys: Sequence[str]) -> Figure:
+def sweep_figure(columns: Mapping[str, NDArray[Any]], keys: Sequence[str], credit: str = "") -> Figure:
     """Collision risk of each planner with its 95 % interval along the last key, a panel for the others.
 
     Parameters
@@ -44,6 +44,8 @@ def sweep_figure(columns: Mapping[str, NDArray[Any]], keys: Sequence[str]) -> Fi
         As :func:`napf_mpc.sweep.run_sweep` returns them.
     keys : sequence of str
         Keys that were varied.
+    credit : str
+        Source and licence of shared data, printed below.
     """
     *others, along = keys
     panels = list(dict.fromkeys(zip(*(columns[key].tolist() for key in others), strict=True))) or [()]
@@ -54,7 +56,7 @@ def sweep_figure(columns: Mapping[str, NDArray[Any]], keys: Sequence[str]) -> Fi
     head = 0.12 + 0.14 * lines
     row_in = TALL_IN + head + BOTTOM_IN
     down = -(-len(panels) // COLUMNS)
-    page = Page.of_size(wide, down * row_in + HEAD_IN, "")
+    page = Page.of_size(wide, down * row_in + HEAD_IN, credit)
     width = (wide - LEFT_IN - RIGHT_IN - (across - 1) * GAP_IN) / across
     highest = round_up(float(columns["collision_risk_high"].max()))
     values = list(dict.fromkeys(columns[along].tolist()))
@@ -108,7 +110,9 @@ def sweep_figure(columns: Mapping[str, NDArray[Any]], keys: Sequence[str]) -> Fi
     return page.figure
 
 
-def draw_sweep(columns: Mapping[str, NDArray[Any]], keys: Sequence[str], out: Path) -> list[Path]:
+def draw_sweep(
+    columns: Mapping[str, NDArray[Any]], keys: Sequence[str], out: Path, credit: str = ""
+) -> list[Path]:
     """Write :func:`sweep_figure` as ``sweep.png`` and ``sweep.svg``.
 
     Raises
@@ -117,7 +121,7 @@ def draw_sweep(columns: Mapping[str, NDArray[Any]], keys: Sequence[str], out: Pa
         If the folder cannot be written.
     """
     with house_style():
-        return save(sweep_figure(columns, keys), out, "sweep")
+        return save(sweep_figure(columns, keys, credit), out, "sweep")
 
 
 def _title(keys: Sequence[str], values: Sequence[str]) -> list[str]:

@@ -5,11 +5,11 @@ A limit state g of standard-normal numbers u fails where g(u) <= 0. With thresho
 .. math:: P(g \le 0) = P(g \le b_1) \prod_{i=2}^{m} P(g \le b_i \mid g \le b_{i-1}),
 
 and each threshold is put where a tenth of the samples of its level lie below (Au and Beck 2001). Samples
-under a condition come from Markov chains that start at those of the level before which meet it. A step is
+under a condition come from Markov chains that start at those of the level before which meet it. A step
 
 .. math:: u' = \sqrt{1 - \sigma^2} \, u + \sigma \xi, \qquad \xi \sim N(0, I),
 
-which leaves the standard normal law as it is in any number of dimensions, and is refused where g(u') is above
+leaves the standard normal law as it is in any number of dimensions, and is refused where g(u') is above
 the threshold: conditional sampling, with sigma adapted until 44 % of the steps are taken (Papaioannou, Betz,
 Zwirglmaier and Straub 2015; elsewhere known as the preconditioned Crank-Nicolson proposal).
 """
@@ -185,8 +185,8 @@ def _chains(
     level: int,
 ) -> tuple[Array, Array, float, float]:
     """Grow chains under a condition, all in lock-step; samples by step, then by chain."""
-    # One sigma for all numbers. One for each, from the spread of the chains' starts as is often advised,
-    # depends on the very points it moves: two modes in 100 dimensions at 1e-6 then come out 30 % too low.
+    # One sigma for all numbers. One for each, from the spread of the chains' starts, would depend on the very
+    # points it moves: with more numbers than chains the estimate comes out wrong to one side.
     states, values, taken = np.empty((chain, *u.shape)), np.empty((chain, len(g))), []
     states[0], values[0] = u, g
     for step in range(1, chain):
