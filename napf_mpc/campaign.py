@@ -196,7 +196,7 @@ def run_campaign(
                 kept = _kept(blocks, chunk, result, problem.uav_count, warn)
                 count += len(chunk)
                 progress(count)
-                if prefix is not None:
+                if prefix is not None and kept is not None:
                     prefix.add(chunk, kept.rows)
                     if prefix.answer is not None:
                         break
@@ -211,8 +211,10 @@ def run_campaign(
     return summary
 
 
-def _kept(blocks: Blocks, runs: range, result: Block | Lost, uavs: int, warn: Callable[[str], None]) -> Block:
-    """Keep a finished block; file a lost one."""
+def _kept(
+    blocks: Blocks, runs: range, result: Block | Lost, uavs: int, warn: Callable[[str], None]
+) -> Block | None:
+    """Keep a finished block; file a lost one, which no stopping rule must take for safe runs."""
     if not isinstance(result, Lost):
         blocks.add(runs, result)
         return result
@@ -223,7 +225,7 @@ def _kept(blocks: Blocks, runs: range, result: Block | Lost, uavs: int, warn: Ca
         f"runs {runs.start} to {runs.stop - 1} were lost twice and are filed as {result.outcome}: "
         f"{result.reason}; repeat the command to fly them again"
     )
-    return filed
+    return None
 
 
 def check_flyable(

@@ -293,6 +293,26 @@ def test_looks_are_fixed_and_grow() -> None:
     assert len(far) < 150
 
 
+def test_a_stopping_rule_does_not_take_lost_runs_for_safe_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Runs 40 to 59 are lost: nothing from there on is shown to the rule, and all runs are flown."""
+    shown: list[int] = []
+
+    def enough(rows: store.Columns) -> bool:
+        shown.append(len(set(rows["run"].tolist())))
+        return len(shown) == 2
+
+    with monkeypatch.context() as patch:
+        broken_at(patch, 57)
+        fly(tmp_path, 120, block_runs=20, enough=enough)
+    assert shown == []
+    assert len(set(store.read_table(tmp_path / "runs.parquet")["run"].tolist())) == 120
+    fly(tmp_path, 120, block_runs=20, enough=enough)
+    assert shown == [50, 100]
+    assert len(set(store.read_table(tmp_path / "runs.parquet")["run"].tolist())) == 100
+
+
 @pytest.mark.parametrize(("workers", "block_runs"), [(1, 100), (1, 7), (2, 30)])
 def test_a_stopping_rule_ends_a_campaign_at_the_same_run_whatever_the_blocks(
     workers: int, block_runs: int, tmp_path: Path

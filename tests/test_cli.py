@@ -471,16 +471,16 @@ def test_montecarlo_stops_when_enough_is_known(
 ) -> None:
     out = tmp_path / "out"
     words = ["montecarlo", problem, "--planner", "apf", "--seed", "2", "--workers", "1", "--out", out]
-    code, text, err = done(capsys, *words, "--runs", "60", "--until-width", "0.6", "--until-upper", "0.001")
+    code, text, err = done(capsys, *words, "--runs", "200", "--until-width", "0.6", "--until-upper", "0.001")
     assert (code, err) == (0, "")
     assert "Stopping rule until-width 0.6 or until-upper 0.001: met after" in text
     runs = len(store.read_table(out / "runs.parquet")["run"])
-    assert runs < 30
-    assert f"met after {runs} of at most 60 runs" in (out / "comparison.md").read_text()
+    assert runs == 50
+    assert f"met after {runs} of at most 200 runs" in (out / "comparison.md").read_text()
     # The same folder serves a rule that asks for more, and a fixed number of runs.
-    assert done(capsys, *words, "--runs", "60", "--until-width", "0.5", "--quiet")[0] == 0
-    assert runs < len(store.read_table(out / "runs.parquet")["run"]) < 60
-    assert done(capsys, *words, "--runs", "60", "--quiet")[0] == 0
+    assert done(capsys, *words, "--runs", "200", "--until-width", "0.27", "--quiet")[0] == 0
+    assert runs < len(store.read_table(out / "runs.parquet")["run"]) < 200
+    assert done(capsys, *words, "--runs", "200", "--quiet")[0] == 0
     assert "stopping" not in json.loads((out / "summary.json").read_text())
 
 
