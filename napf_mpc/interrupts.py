@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NoReturn
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
-GRACE_S = 2.0
+GRACE_S = 2.5
 """Time to unwind; whatever hangs then is left behind. Results are safe: files appear whole or not at all."""
 
 _words = "stopped"
