@@ -677,8 +677,8 @@ class Planner(_Section):
     """QP planner: weight of the torques [1/(N^2 m^2 s)]."""
     contact_price: float = Field(300.0, ge=0.0, le=1e9)
     """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]."""
-    margin: Literal["auto", "half_space", "passage"] = "auto"
-    """QP planner: margin beside spheres: k sigma as behind a wall, or what makes a hit in passing as likely as there, which is less; auto: the latter without a filter, k sigma behind one."""  # noqa: E501
+    margin: Literal["half_space", "passage"] = "half_space"
+    """QP planner: margin beside spheres: k sigma as behind a wall, or what makes a hit in passing as likely as there, which is less."""  # noqa: E501
     contact_extra_m: float = Field(0.75, ge=0.0, le=1e3)
     """QP planner: distance kept from obstacles on top of the margin, at most."""
     contact_extra_sigmas: float = Field(0.95, ge=0.0, le=1e3)

@@ -27,7 +27,6 @@ def drawn_together(
     counted: NDArray[np.bool_],
     share: Array | float,
     frame: PathFrame,
-    sigma_m: Array | float = 0.0,
 ) -> Array:
     """References, each moved sideways by a share of the mean that the plans are off their lanes.
 
@@ -41,10 +40,6 @@ def drawn_together(
         c, 0 <= c < 1.
     frame : PathFrame
         Of the path.
-    sigma_m : array, shape (run, uav, 2), or float
-        Of what will prove to have been error in where the plans are, left and up [m]. A mean m counts by the
-        part ``m^2 / (m^2 + s^2)``, with s that of the mean of independent errors: measurements jump, and the
-        formation is not to jump along.
 
     Returns
     -------
@@ -53,33 +48,22 @@ def drawn_together(
     """
     out = reference.copy()
     shares = plain(np.broadcast_to(np.asarray(share, dtype=np.float64), reference.shape[:3]))
-    noise = plain(np.broadcast_to(np.square(sigma_m), (*reference.shape[:2], 2)))
-    _draw(plain(plans), plain(free), counted, plain(frame.axes), shares, noise, out)
+    _draw(plain(plans), plain(free), counted, plain(frame.axes), shares, out)
     return out
 
 
 @compiled
 def _draw(
-    plans: Array,
-    free: Array,
-    counted: NDArray[np.bool_],
-    axes: Array,
-    share: Array,
-    noise: Array,
-    out: Array,
+    plans: Array, free: Array, counted: NDArray[np.bool_], axes: Array, share: Array, out: Array
 ) -> None:
     runs, uavs, stages = plans.shape[:3]
-    off, doubt = np.empty((2, 2)), np.empty(2)
+    off = np.empty((2, 2))
     for run in range(runs):
         count = 0
         for uav in range(uavs):
             count += counted[run, uav]
         if count == 0:
             continue
-        doubt[:] = 0.0
-        for uav in range(uavs):
-            for a in range(2):
-                doubt[a] += noise[run, uav, a] / (count * count) if counted[run, uav] else 0.0
         for n in range(stages):
             off[:] = 0.0
             for uav in range(uavs):
@@ -93,11 +77,6 @@ def _draw(
                         speed += axes[1 + a, b] * (plans[run, uav, n, b1] - free[run, uav, n, b1])
                     off[0, a] += min(max(place, -LARGEST_PULL_M), LARGEST_PULL_M) / count
                     off[1, a] += speed / count
-            for a in range(2):
-                square = off[0, a] * off[0, a]
-                believed = square / (square + doubt[a]) if doubt[a] > 0.0 else 1.0
-                off[0, a] *= believed
-                off[1, a] *= believed
             for uav in range(uavs):
                 for b in range(3):
                     for rate in range(2):

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.constraints.clearance import Margin, ObstacleContact, ObstacleInfluence
+from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, InputBox, SpeedLimit, TiltLimit
 from napf_mpc.constraints.moving import MovingObstacleContact
@@ -61,22 +61,10 @@ _CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
 _WORDS = np.array([status.value for status in STATUSES])
 
 
-def margin_of(problem: Problem) -> Margin:
-    """Margin beside spheres that a problem asks for.
-
-    Errors of measurements are metres and come and go, and a wall's margin then is far more than a ball needs.
-    Behind a filter there is little to gain, and what is left on top of the margin there counts on it.
-    """
-    asked = problem.planner.margin
-    if asked == "auto":
-        return "passage" if problem.navigation.filter == "none" else "half_space"
-    return asked
-
-
 def default_constraints(problem: Problem) -> list[Constraint]:
     """Rows of the QP as a problem's settings ask for them."""
     settings = problem.planner
-    rows, price, margin = settings.obstacle_rows, settings.contact_price, margin_of(problem)
+    rows, price, margin = settings.obstacle_rows, settings.contact_price, settings.margin
     contact = ObstacleContact(
         obstacles=rows,
         w1=price,
@@ -160,7 +148,7 @@ class QpPlanner:
         self._slots = SlotReference.of_problem(problem, problem.mission)
         follows = settings.guidance == "blended" if guided is None else guided
         self._inflation = Inflation.of_problem(problem)
-        margins = passage_margins(self._inflation) if margin_of(problem) == "passage" else None
+        margins = passage_margins(self._inflation) if settings.margin == "passage" else None
         self._guidance = Guidance(problem, self._inflation, margins=margins) if follows else None
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
         self._period_s = 1.0 / settings.rate_hz
@@ -303,32 +291,19 @@ class QpPlanner:
         place, times = state[..., POSITION], self._model.times_s
         sigma = self._to_be_corrected(nav, trusted, covariance)
         share: Array | float = self.problem.planner.cohesion
-        # An estimate's jumps are those that the filter corrects: small beside what bends a shape.
-        doubt: Array | float = 0.0 if nav.filtered else sigma[..., 1:]
         if guide is None:
             free = reference = way = self._slots.over(place, times, sigma)
         else:
             way = self._slots.over(place, times, sigma, guide)
             if guide.taut is None:
-                return self._together(way, way, carried, trusted, share, doubt), way
+                return way, way
             free = self._slots.over(place, times, sigma, guide.on_lanes())
             reference = self._slots.over(place, times, sigma, guide.pulled())
             along = self._frame.along_track
             share = share * guide.loose_at(along(free[..., POSITION]) - along(place)[..., None])
-        return self._together(reference, free, carried, trusted, share, doubt), way
-
-    def _together(
-        self,
-        reference: Array,
-        free: Array,
-        carried: tuple[Array, Array] | None,
-        trusted: Mask,
-        share: Array | float,
-        sigma_m: Array | float,
-    ) -> Array:
-        if carried is None or len(self._lanes) == 1:
-            return reference
-        return drawn_together(reference, free, carried[0], trusted, share, self._frame, sigma_m)
+        if carried is not None and len(self._lanes) > 1:
+            reference = drawn_together(reference, free, carried[0], trusted, share, self._frame)
+        return reference, way
 
     def _guess(
         self, state: Array, way: Array, carried: tuple[Array, Array] | None, time_s: float

@@ -79,20 +79,3 @@ def test_each_place_has_its_own_share() -> None:
     assert drawn[0, 1, 2, 2] == pytest.approx(1.0)
     drawn[0, 1, 2, 2] = 0.0
     np.testing.assert_array_equal(drawn, lanes)
-
-
-def test_what_may_be_error_in_the_mean_counts_by_how_far_it_is_believed() -> None:
-    """Errors of 2 m in four plans: 1 m in their mean. A mean of 2 m counts four fifths, of 10 cm nothing."""
-    frame = FRAMES[1]
-    lanes, sigma = states(np.zeros((UAVS, 3))), np.full((1, UAVS, 2), 2.0)
-    plans = states(sideways(frame, [2.0, 2.0, 2.0, 2.0], up=0.1))
-    plans[..., 1:6:2] = 0.5 * frame.axes[1]
-    moved = drawn_together(lanes, lanes, plans, ALL, 0.5, frame, sigma) - lanes
-    np.testing.assert_allclose(moved[..., 0:6:2] @ frame.axes[1], 0.5 * 0.8 * 2.0, rtol=1e-9)
-    np.testing.assert_allclose(moved[..., 1:6:2] @ frame.axes[1], 0.5 * 0.8 * 0.5, rtol=1e-9)
-    np.testing.assert_allclose(moved[..., 0:6:2] @ frame.axes[2], 0.5 * 0.1 * 0.01 / 1.01, rtol=1e-9)
-    # Of two that are followed, the mean is less certain.
-    two = ALL.copy()
-    two[0, 2:] = False
-    moved = drawn_together(lanes, lanes, plans, two, 0.5, frame, sigma) - lanes
-    np.testing.assert_allclose(moved[..., 0:6:2] @ frame.axes[1], 0.5 * 2.0 * 4.0 / 6.0, rtol=1e-9)

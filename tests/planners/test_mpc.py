@@ -242,21 +242,10 @@ def test_a_height_band_is_rows_of_the_program_and_none_by_default() -> None:
     assert bands(problem(planner={"kind": "qp", "altitude_m": (-2.0, 3.5)})) == [(-2.0, 3.5)]
 
 
-@pytest.mark.parametrize(
-    ("asked_for", "navigation", "margin", "share"),
-    [
-        ("half_space", "none", "half_space", 1.0),
-        ("passage", "kalman", "passage", 0.79),
-        ("auto", "none", "passage", 0.79),
-        ("auto", "kalman", "half_space", 1.0),
-    ],
-)
-def test_rows_and_guidance_keep_the_margin_that_the_problem_asks_for(
-    asked_for: str, navigation: str, margin: str, share: float
-) -> None:
+@pytest.mark.parametrize(("margin", "share"), [("half_space", 1.0), ("passage", 0.79)])
+def test_rows_and_guidance_keep_the_margin_that_the_problem_asks_for(margin: str, share: float) -> None:
     """A ball of 2 m and an error of 5 m: four fifths of a wall's margin for the one, all for the other."""
-    settings = {"kind": "qp", "k": 3.0, "margin": asked_for, "contact_extra_m": 0.0}
-    asked = problem(planner=settings, navigation={"filter": navigation})
+    asked = problem(planner={"kind": "qp", "k": 3.0, "margin": margin, "contact_extra_m": 0.0})
     made = default_constraints(asked)
     shells = [each for each in made if isinstance(each, (ObstacleContact, ObstacleInfluence))]
     assert [shell.margin for shell in shells] == [margin, margin]
