@@ -107,9 +107,10 @@ def sigmas_beside(margins: PassageMargins, radius: float, sigma: float, g: float
     i, a = _place(radius / sigma, RADII[0], RADII[1], RADII[2])
     j, b = _place(g / (sigma * sigma), ACROSS[0], ACROSS[1], ACROSS[2])
     table = margins.sigmas
-    near = (1.0 - b) * table[i, j] + b * table[i, j + 1]
-    far = (1.0 - b) * table[i + 1, j] + b * table[i + 1, j + 1]
-    return float((1.0 - a) * near + a * far)
+    # In this form a table of one number gives that number, to the last bit.
+    near = table[i, j] + b * (table[i, j + 1] - table[i, j])
+    far = table[i + 1, j] + b * (table[i + 1, j + 1] - table[i + 1, j])
+    return float(near + a * (far - near))
 
 
 @compiled

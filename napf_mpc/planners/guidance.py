@@ -64,7 +64,7 @@ class Guidance:
     settings : GuidanceSettings, optional
         Weights and limits.
     margins : PassageMargins, optional
-        Sigmas to keep from spheres and cylinders, by default k.
+        Sigmas to keep from spheres, by default k.
     """
 
     def __init__(

@@ -81,7 +81,13 @@ def test_what_is_large_is_a_wall_and_what_is_small_takes_less() -> None:
 def test_without_a_size_or_an_error_it_is_k_sigma() -> None:
     assert sigmas_beside(PASSAGE, 0.0, 1.0, 1.0) == K
     assert sigmas_beside(PASSAGE, 1.0, 0.0, 0.0) == K
-    assert sigmas_beside(half_space_margins(2.5), 0.7, 3.0, 5.0) == 2.5
+
+
+def test_a_wall_everywhere_is_k_to_the_last_bit() -> None:
+    wall = half_space_margins(2.3)
+    rng = np.random.default_rng(4)
+    for radius, sigma, g in np.exp(rng.uniform(-3.0, 3.0, (500, 3))):
+        assert sigmas_beside(wall, radius, sigma, g) == 2.3
 
 
 @pytest.mark.parametrize("radius", [0.8, 2.3, 6.0])
