@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from napf_mpc.constraints.passage import half_space_margins
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guide_clearance import (
     Sight,
@@ -38,7 +39,7 @@ from napf_mpc.world.shapes import Box, Cylinder, Shape, Sphere
 
 Array = NDArray[np.float64]
 
-SEARCH = search_of(GuidanceSettings(widest_m=10.0, ahead_m=40.0), 3.0, 0.3)
+SEARCH = search_of(GuidanceSettings(widest_m=10.0, ahead_m=40.0), half_space_margins(3.0), 0.3)
 LATTICE, PRICES = SEARCH.lattice, SEARCH.prices
 GENTLE = PRICES._replace(path=1.5, slope=16.0, steep=0.7, steep_far=0.7, far_m=8.0)
 """Prices for which the way back to the lane is nowhere steep, which :func:`price_ahead` leaves out."""
@@ -70,12 +71,12 @@ def seen(shapes: list[Shape], path: PathFrame, covariance: Array) -> Sight:
     scratch = make_scratch(2, 2 * LATTICE.stations - 1, len(shapes), SEARCH)
     need = SEARCH.radius_m + PRICES.spare_m
     sight = Sight(
-        solids, frame_of(path), SEARCH.k, need, np.array([0.0, -4.0]), np.tile(LANE, (2, 1)),
-        np.tile(covariance, (2, 1, 1)), scratch.turned, scratch.reach, scratch.found, scratch.solid_count,
+        solids, frame_of(path), SEARCH.margins, SEARCH.radius_m, need, np.array([0.0, -4.0]),
+        np.tile(LANE, (2, 1)), np.tile(covariance, (2, 1, 1)), scratch.turned, scratch.reach, scratch.found, scratch.solid_count,
         scratch.near, scratch.here, scratch.here_count, scratch.missing, scratch.known,
     )  # fmt: skip
     for i in range(2):
-        sight.reach[i] = largest_reach(covariance, SEARCH.k, need)
+        sight.reach[i] = largest_reach(covariance, SEARCH.margins.k, need)
         sight.solid_count[i] = gather(
             boxes, 0, len(shapes), -10.0, 50.0, -30.0, 30.0, sight.reach[i], sight.found[i]
         )
@@ -133,7 +134,15 @@ def all_missing(sight: Sight, shapes: list[Shape], path: PathFrame, i: int) -> A
             left = LANE[0] + (c - LATTICE.half) * LATTICE.cell_m
             up = LANE[1] + (v - BELOW) * LATTICE.layer_m
             short = shortfall(
-                sight.solids, solid, sight.frame, at, left, up, sight.covariance[i], sight.k, sight.need_m
+                sight.solids,
+                solid,
+                sight.frame,
+                at,
+                left,
+                up,
+                sight.covariance[i],
+                sight.margins.k,
+                sight.need_m,
             )[0]
             out[s, v, c] = max(out[s, v, c], short)
     return out
