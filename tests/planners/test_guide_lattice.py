@@ -72,7 +72,8 @@ def seen(shapes: list[Shape], path: PathFrame, covariance: Array) -> Sight:
     need = SEARCH.radius_m + PRICES.spare_m
     sight = Sight(
         solids, frame_of(path), SEARCH.margins, SEARCH.radius_m, need, np.array([0.0, -4.0]),
-        np.tile(LANE, (2, 1)), np.tile(covariance, (2, 1, 1)), scratch.turned, scratch.reach, scratch.found, scratch.solid_count,
+        np.tile(LANE, (2, 1)), np.tile(covariance, (2, 1, 1)), scratch.turned, scratch.reach,
+        scratch.found, scratch.solid_count,
         scratch.near, scratch.here, scratch.here_count, scratch.missing, scratch.known,
     )  # fmt: skip
     for i in range(2):
