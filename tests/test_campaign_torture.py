@@ -1,12 +1,16 @@
 """Disturbed campaigns are the undisturbed one in the end; ``benchmarks/campaign_torture.py`` in short."""
 
 import io
+import os
 import sys
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("resource", reason="signals, process groups and limits are POSIX")
+
+if not os.environ.get("NAPF_MPC_TORTURE"):
+    pytest.skip("takes many minutes: set NAPF_MPC_TORTURE=1", allow_module_level=True)
 
 from campaign_torture import KINDS, good, may_mount, torture_all
 
