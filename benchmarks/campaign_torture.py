@@ -97,14 +97,19 @@ class Torture:
         self._moments = random.Random(seed)
         self._count = 0
         (folder / "problem.toml").write_text(PROBLEM, encoding="utf-8")
+        self._undisturbed()  # the first one may compile: disturbances spread over that time come too late
         began = time.monotonic()
-        self._whole = self.fresh()
-        with self._started(self._whole) as process:
+        self._whole = self._undisturbed()
+        self._took_s = time.monotonic() - began
+        self.expected = digest(self._whole)
+
+    def _undisturbed(self) -> Path:
+        out = self.fresh()
+        with self._started(out) as process:
             _, words = process.communicate()
         if process.returncode != 0:
             raise SystemExit(f"the undisturbed campaign failed: {words}")
-        self._took_s = time.monotonic() - began
-        self.expected = digest(self._whole)
+        return out
 
     def fresh(self) -> Path:
         """Name a folder that is not there yet."""
@@ -131,11 +136,22 @@ class Torture:
                 os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
 
+    @staticmethod
+    def _tries(tally: Tally, times: int) -> Iterator[None]:
+        """Go on until there were enough disturbances: some moments come too late, but not nearly all."""
+        most = 10 + 5 * times
+        for _ in range(most):
+            if tally.disturbed >= times:
+                return
+            yield
+        if tally.disturbed < times:
+            raise SystemExit(f"{tally.disturbed} disturbances in {most} campaigns: too few to mean much")
+
     def signals(self, times: int, signum: int, *, group: bool) -> Tally:
         """Send a signal at a random moment, and go on, again and again."""
         tally = Tally()
         out = self.fresh()
-        while tally.disturbed < times:
+        for _ in self._tries(tally, times):
             kept = set(finished(out))
             with self._started(out) as process:
                 time.sleep(self._moments.uniform(0.0, self._took_s))
@@ -167,7 +183,7 @@ class Torture:
     def dead_workers(self, times: int) -> Tally:
         """Kill one worker at a random moment of each campaign."""
         tally = Tally()
-        while tally.disturbed < times:
+        for _ in self._tries(tally, times):
             out = self.fresh()
             with self._started(out) as process:
                 time.sleep(self._moments.uniform(0.0, self._took_s))
@@ -186,7 +202,7 @@ class Torture:
         """Let the disk be full at a random moment, then make room."""
         tally = Tally()
         used = [-(-path.stat().st_size // PAGE) * PAGE for path in self._whole.rglob("*") if path.is_file()]
-        while tally.disturbed < times:
+        for _ in self._tries(tally, times):
             disk = self.fresh()
             disk.mkdir()
             out = disk / "out"
@@ -249,7 +265,7 @@ def finished(out: Path) -> list[str]:
 
 def processes() -> list[list[str]]:
     """Process, its parent, its group, its state and its command."""
-    words = ["ps", "-A", "-o", "pid=,ppid=,pgid=,stat=,args="]
+    words = ["ps", "-A", "-ww", "-o", "pid=,ppid=,pgid=,stat=,args="]
     listed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     return [line.split(None, 4) for line in listed.splitlines()]
 
@@ -304,6 +320,11 @@ def may_mount(folder: Path) -> bool:
         place.rmdir()
 
 
+def full_disk(folder: Path) -> str:
+    """Name the kind of full disk that this process may make."""
+    return "disk full" if may_mount(folder) else "file too large"
+
+
 KINDS: dict[str, Callable[[Torture, int], Tally]] = {
     "kill -9 of the group": lambda torture, n: torture.signals(n, signal.SIGKILL, group=True),
     "kill -9 of the parent": lambda torture, n: torture.signals(n, signal.SIGKILL, group=False),
@@ -351,7 +372,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(prefix="torture-") as name:
         folder = Path(name)
-        disk = "disk full" if may_mount(folder) else "file too large"
+        disk = full_disk(folder)
         if disk != "disk full":
             print("mounting is not permitted: a limit on the size of files stands in for full disks")
         kinds = asked.kinds or [kind for kind in KINDS if kind not in ("disk full", "file too large")] + [

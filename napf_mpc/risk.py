@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtri
 
 Array = NDArray[np.float64]
 
@@ -39,6 +39,8 @@ def wilson(count: int, total: int) -> Rate:
     """
     if total < 1 or not 0 <= count <= total:
         raise ValueError(f"need 0 <= count <= total and total >= 1, got count {count}, total {total}")
+    from scipy import stats  # a quarter of the start of a process, and workers have no use for it
+
     interval = stats.binomtest(count, total).proportion_ci(method="wilson")
     return Rate(count, total, count / total, float(interval.low), float(interval.high))
 
@@ -63,7 +65,7 @@ def clustered_rate(hits: NDArray[np.int64], size: int) -> Rate:
     between = float(np.var(hits / size, ddof=1)) / runs if runs > 1 else 0.0
     effective = value * (1.0 - value) / between if between > 0.0 else float(runs)
     effective = min(max(effective, float(runs)), float(total))
-    z = float(stats.norm.ppf(0.975))
+    z = float(ndtri(0.975))
     centre = (value + z * z / (2.0 * effective)) / (1.0 + z * z / effective)
     spread = math.sqrt(value * (1.0 - value) / effective + z * z / (4.0 * effective**2))
     half = z * spread / (1.0 + z * z / effective)
@@ -96,6 +98,8 @@ class Paired:
 
 def mcnemar(only_a: int, only_b: int) -> float:
     """Two-sided exact McNemar p-value: a binomial test of the runs in which just one of two hit."""
+    from scipy import stats  # as above
+
     discordant = only_a + only_b
     return 1.0 if discordant == 0 else float(stats.binomtest(only_a, discordant, 0.5).pvalue)
 

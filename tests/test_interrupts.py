@@ -1,9 +1,7 @@
-"""Ctrl-C, SIGTERM, kill -9 at random moments: a clean stop, nothing left, the same bits when repeated."""
+"""Ctrl-C, SIGTERM, kill -9: a clean stop, nothing left; ``test_campaign_torture.py`` goes on from there."""
 
 import contextlib
-import hashlib
 import os
-import random
 import re
 import signal
 import subprocess
@@ -14,28 +12,15 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals and process groups are POSIX")
+pytest.importorskip("resource", reason="signals and process groups are POSIX")
 
-RUNS = 96
+from campaign_torture import PROBLEM, START, finished, left_over
+
 MANY = 9600
 """Runs of a campaign that is not meant to end by itself."""
-PROBLEM = """
-# 64 UAVs: sixteen runs fill a block, so that a short campaign has six of them.
-[formation]
-shape = "line"
-count = 64
-[mission]
-length_m = 100.0
-[world]
-kind = "lanes"
-count = 8
-along_range_m = [0.0, 6.0]
-[simulation]
-time_limit_s = 2.5
-"""
 
 
-def command(out: Path, *options: str, runs: int = RUNS) -> list[str]:
+def command(out: Path, *options: str) -> list[str]:
     problem = out.parent / "problem.toml"
     problem.write_text(PROBLEM)
     words = [
@@ -44,25 +29,20 @@ def command(out: Path, *options: str, runs: int = RUNS) -> list[str]:
         "--planner",
         "apf",
         "--runs",
-        str(runs),
+        str(MANY),
         "--seed",
         "3",
         "--out",
         str(out),
     ]
-    # Without figures, which take longer than these flights.
-    start = (
-        "import sys, types; from napf_mpc.__main__ import main;"
-        "sys.modules['napf_mpc.figures'] = types.SimpleNamespace(draw_comparison=lambda *_: []); main()"
-    )
-    return [sys.executable, "-c", start, *words, "--quiet", *options]
+    return [sys.executable, "-c", START, *words, "--quiet", *options]
 
 
 @contextlib.contextmanager
-def started(out: Path, *options: str, runs: int = RUNS) -> Iterator[subprocess.Popen[str]]:
+def started(out: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
     """Start a campaign as the leader of a group of its own; whatever is left of it goes at the end."""
     process = subprocess.Popen(
-        command(out, *options, runs=runs),
+        command(out, *options),
         start_new_session=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -76,13 +56,6 @@ def started(out: Path, *options: str, runs: int = RUNS) -> Iterator[subprocess.P
         process.communicate()
 
 
-def alive(group: int) -> list[str]:
-    """Processes of a group that still run; those that only wait for their parent to look at them do not."""
-    ps = subprocess.run(["ps", "-A", "-o", "pgid=,stat=,args="], capture_output=True, text=True, check=True)
-    lines = [line.split(None, 2) for line in ps.stdout.splitlines()]
-    return [words[-1] for words in lines if words[0] == str(group) and not words[1].startswith("Z")]
-
-
 def wait_until_flying(out: Path, process: subprocess.Popen[str], blocks: int = 0) -> None:
     deadline = time.monotonic() + 120.0
     while process.poll() is None and time.monotonic() < deadline:
@@ -90,31 +63,6 @@ def wait_until_flying(out: Path, process: subprocess.Popen[str], blocks: int = 0
             return
         time.sleep(0.01)
     raise AssertionError(f"ended before it could be stopped: {process.communicate()}")
-
-
-def finished(out: Path) -> list[Path]:
-    return sorted((out / "blocks").glob("rows_*.parquet"))
-
-
-def digest(out: Path) -> str:
-    return hashlib.sha256((out / "runs.parquet").read_bytes()).hexdigest()
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> str:
-    out = tmp_path_factory.mktemp("undisturbed") / "out"
-    with started(out, "--workers", "1") as process:
-        stdout, stderr = process.communicate(timeout=300)
-    assert (process.returncode, stdout, stderr) == (0, "", "")
-    assert len(finished(out)) == 6
-    return digest(out)
-
-
-def complete(out: Path) -> str:
-    with started(out, "--workers", "2") as process:
-        _, stderr = process.communicate(timeout=300)
-    assert (process.returncode, stderr) == (0, "")
-    return digest(out)
 
 
 @pytest.mark.parametrize(
@@ -130,16 +78,13 @@ def test_a_stop_is_prompt_keeps_blocks_and_leaves_nothing_behind(
     signum: signal.Signals, workers: int, group: bool, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with started(out, "--workers", str(workers), runs=MANY) as process:
+    with started(out, "--workers", str(workers)) as process:
         wait_until_flying(out, process, blocks=1)
         before = time.monotonic()
         os.killpg(process.pid, signum) if group else process.send_signal(signum)
         stdout, stderr = process.communicate(timeout=30)
         took = time.monotonic() - before
-        deadline = before + 3.0
-        while alive(process.pid) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        assert alive(process.pid) == []
+        assert left_over(process.pid, before + 3.0 - time.monotonic()) == []
     assert process.returncode == 128 + signum
     assert took < 3.0
     assert stdout == ""
@@ -190,42 +135,13 @@ def test_an_error_of_its_own_is_told_as_ever() -> None:
     assert "ZeroDivisionError" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("kind", "seed"), [("ctrl-c", 1), pytest.param("kill -9", 2, marks=pytest.mark.slow)]
-)
-def test_five_stops_at_random_moments_lose_nothing(
-    kind: str, seed: int, undisturbed: str, tmp_path: Path
-) -> None:
-    """Five times on the way to one result; each may come while processes start, fly, write or conclude."""
-    out = tmp_path / "out"
-    moments = random.Random(seed)
-    kept = 0
-    for _ in range(5):
-        (out / ".lock").unlink(missing_ok=True)
-        with started(out, "--workers", "2") as process:
-            wait_until_flying(out, process)
-            time.sleep(moments.uniform(0.0, 2.0))
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGINT if kind == "ctrl-c" else signal.SIGKILL)
-            _, stderr = process.communicate(timeout=30)
-            assert process.returncode in ((0, 130) if kind == "ctrl-c" else (0, -9))
-            if process.returncode == 130:  # no other word, not even from a worker that was just starting
-                assert re.fullmatch(r"stopped: \d+ of 96 runs are kept .*\n", stderr), stderr
-        assert len(finished(out)) >= kept
-        kept = len(finished(out))
-    assert complete(out) == undisturbed
-
-
 def test_workers_end_with_a_process_that_was_killed(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with started(out, "--workers", "2", runs=MANY) as process:
+    with started(out, "--workers", "2") as process:
         wait_until_flying(out, process, blocks=1)
         process.kill()  # this process alone: its workers get no signal
         process.wait()
-        deadline = time.monotonic() + 10.0
-        while alive(process.pid) and time.monotonic() < deadline:
-            time.sleep(0.1)
-        assert alive(process.pid) == []
+        assert left_over(process.pid) == []
 
 
 STUCK = """
