@@ -291,15 +291,7 @@ def sweep(
     points = grid_points(file, vary, settings or ())
     names = _names(points[0].problem.planner.kind if planners is None else planners)
     total = len(points) * runs
-    with _progress(total, quiet or as_json) as tell:
-
-        def progress(done: int) -> None:
-            interrupts.raise_if_asked()
-            tell(done)
-            interrupts.when_stopped(
-                f"stopped: {done} of {total} runs are kept in {out}; repeat the command to go on"
-            )
-
+    with _progress(total, out, quiet or as_json) as progress:
         columns = run_sweep(
             points, names, runs, seed, out, name=_name(file), workers=_processes(workers),
             data_folder=data, progress=progress,
@@ -343,15 +335,7 @@ def rare(
     from napf_mpc.rare_events.estimate import check_samples, estimate_collision_risk
 
     check_samples(samples)
-    with _progress(None, quiet or as_json) as tell:
-
-        def progress(done: int) -> None:
-            interrupts.raise_if_asked()
-            tell(done)
-            interrupts.when_stopped(
-                f"stopped: {done} missions are kept in {out}; repeat the command to go on"
-            )
-
+    with _progress(None, out, quiet or as_json) as progress:
         summary = estimate_collision_risk(
             problem, problem.planner.kind if planner is None else planner, out, samples=samples, seed=seed,
             name=_name(file), data_folder=data, progress=progress,
@@ -532,16 +516,7 @@ def _campaign(
 
     with ExitStack() as stack:
         kept = out or Path(stack.enter_context(TemporaryDirectory(prefix="napf-mpc-")))
-        tell = stack.enter_context(_progress(runs, quiet or as_json))
-
-        def progress(done: int) -> None:
-            interrupts.raise_if_asked()
-            tell(done)
-            kept_runs = f"{done} of {runs} runs are kept in {out}; repeat the command to go on"
-            interrupts.when_stopped(
-                f"stopped: {'nothing is kept without --out' if out is None else kept_runs}"
-            )
-
+        progress = stack.enter_context(_progress(runs, out, quiet or as_json))
         summary = run_campaign(
             problem, names, runs, seed, kept, name=_name(file), data_folder=data,
             record_every=record_every, progress=progress, warn=_warn, enough=rule, **engine,
@@ -561,17 +536,34 @@ def _campaign(
 
 
 @contextmanager
-def _progress(runs: int | None, silent: bool) -> Iterator[Callable[[int], None]]:
-    """Progress bar on a terminal, nothing anywhere else; without a number of runs it has no end."""
+def _progress(runs: int | None, out: Path | None, silent: bool) -> Iterator[Callable[[int], None]]:
+    """What a campaign tells of the missions it has finished.
+
+    A bar on a terminal, nothing anywhere else; without a number of runs it has no end. It stops where a
+    signal asks for it, and settles what a stop says then.
+    """
+    of_all = "missions" if runs is None else f"of {runs} runs"
+
+    def finished(done: int) -> None:
+        interrupts.raise_if_asked()
+        show(done)
+        kept = f"{done} {of_all} are kept in {out}; repeat the command to go on"
+        interrupts.when_stopped(f"stopped: {'nothing is kept without --out' if out is None else kept}")
+
+    def show(done: int) -> None:
+        if bar is not None:
+            bar.update(task, completed=done)
+
     if silent or not sys.stderr.isatty():
-        yield lambda done: None
+        bar = None
+        yield finished
         return
     from rich.console import Console
     from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("missions", total=runs)
-        yield lambda done: bar.update(task, completed=done)
+        yield finished
 
 
 def _warn(line: str) -> None:

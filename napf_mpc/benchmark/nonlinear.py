@@ -14,11 +14,9 @@ import numpy as np
 
 from napf_mpc.benchmark.contenders import CONTENDERS, OSQP, Scene
 from napf_mpc.benchmark.nmpc import NonlinearProgram
-from napf_mpc.benchmark.programs import Step, flown
+from napf_mpc.benchmark.programs import Step, programs_of
 from napf_mpc.benchmark.solvers import SOLVED, gain, input_span, timed
-from napf_mpc.errors import ProblemError
 from napf_mpc.problem import Problem
-from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import Array, HorizonQp, Layout
 from napf_mpc.solvers.batch import make_batch_solver
 
@@ -62,7 +60,7 @@ def measure_nonlinear(
     scene : Scene
         What is flown, by the quadratic programs.
     missions, every, seed : int
-        Of the flights, see :func:`~.programs.flown`.
+        Of the flights, see :func:`~.programs.programs_of`.
 
     Returns
     -------
@@ -74,11 +72,7 @@ def measure_nonlinear(
     ProblemError
         If the flights are too short to keep two steps.
     """
-    problem = load_problem(scene.problem, {"navigation.filter": "kalman", **scene.overrides})
-    steps = flown(problem, missions=missions, every=every, seed=seed)
-    if len(steps) < 2:
-        fault = f"every = {every}: leaves {len(steps)} steps of a mission, and two are needed; take fewer"
-        raise ProblemError(f"benchmark, {label}", [fault])
+    problem, steps = programs_of(label, scene, missions=missions, every=every, seed=seed)
     return list(_of_scene(label, problem, steps))
 
 

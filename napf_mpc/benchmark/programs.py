@@ -6,9 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from napf_mpc.benchmark.contenders import Scene
 from napf_mpc.closed_loop import build_scenario, closed_loop
+from napf_mpc.errors import ProblemError
 from napf_mpc.planners.mpc import QpPlanner
 from napf_mpc.problem import Problem
+from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import HorizonQp
 from napf_mpc.solvers.batch import BatchResult, Mask, WarmStart, make_batch_solver
 
@@ -79,3 +82,21 @@ def flown(problem: Problem, *, missions: int, every: int, seed: int) -> list[Ste
     recorder = _Recorder(every)
     closed_loop(problem, QpPlanner(problem, solver=recorder), build_scenario(problem, seed, range(missions)))
     return [step for step in recorder.steps if step.programs]
+
+
+def programs_of(
+    label: str, scene: Scene, *, missions: int, every: int, seed: int
+) -> tuple[Problem, list[Step]]:
+    """Fly a scene behind the filter, and give its problem and steps as of :func:`flown`.
+
+    Raises
+    ------
+    ProblemError
+        If the flights are too short to keep two steps: the first pays for what is done once.
+    """
+    problem = load_problem(scene.problem, {"navigation.filter": "kalman", **scene.overrides})
+    steps = flown(problem, missions=missions, every=every, seed=seed)
+    if len(steps) < 2:
+        fault = f"every = {every}: leaves {len(steps)} steps of a mission, and two are needed; take fewer"
+        raise ProblemError(f"benchmark, {label}", [fault])
+    return problem, steps

@@ -25,10 +25,8 @@ from napf_mpc.benchmark.contenders import (
     Scene,
     present,
 )
-from napf_mpc.benchmark.programs import Step, flown
-from napf_mpc.errors import ProblemError
+from napf_mpc.benchmark.programs import Step, programs_of
 from napf_mpc.problem import Problem, Vehicle
-from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import Array, HorizonQp, Layout, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, make_batch_solver
 from napf_mpc.solvers.residuals import relative_residuals
@@ -98,7 +96,7 @@ def measure(
     contenders : mapping
         By label, such as :data:`~.contenders.CONTENDERS`; all installed.
     missions, every, seed : int
-        Of the flights, see :func:`~.programs.flown`.
+        Of the flights, see :func:`~.programs.programs_of`.
 
     Returns
     -------
@@ -110,11 +108,7 @@ def measure(
     ProblemError
         If the flights are too short to keep two steps.
     """
-    problem = load_problem(scene.problem, {"navigation.filter": "kalman", **scene.overrides})
-    steps = flown(problem, missions=missions, every=every, seed=seed)
-    if len(steps) < 2:
-        fault = f"every = {every}: leaves {len(steps)} steps of a mission, and two are needed; take fewer"
-        raise ProblemError(f"benchmark, {label}", [fault])
+    problem, steps = programs_of(label, scene, missions=missions, every=every, seed=seed)
     reference = make_batch_solver(REFERENCE, **REFERENCE_SETTINGS)
     return list(_of_scene(label, problem, steps, contenders, reference))
 

@@ -70,13 +70,18 @@ def tables(summaries: Sequence[Summary], flights: str, wide: bool) -> list[Rows]
         f"{REFERENCE_SETTINGS['eps_abs']:g}, whatever the solver claims. Errors are the largest.",
         machine(),
     )
-    scenes = list(dict.fromkeys(one.scene for one in summaries))
-    shown = []
+    return _by_scene([(one.scene, _cells(one, wide)) for one in summaries], notes)
+
+
+def _by_scene(lines: Sequence[tuple[str, dict[str, str]]], notes: tuple[str, ...]) -> list[Rows]:
+    """One table a scene, from lines of column -> cell; notes below the last."""
+    scenes = list(dict.fromkeys(scene for scene, _ in lines))
+    tables = []
     for scene in scenes:
-        own = [_cells(one, wide) for one in summaries if one.scene == scene]
+        own = [cells for of, cells in lines if of == scene]
         rows = tuple(tuple(cells.values()) for cells in own)
-        shown.append(Rows(scene, tuple(own[0]), rows, notes if scene == scenes[-1] else ()))
-    return shown
+        tables.append(Rows(scene, tuple(own[0]), rows, notes if scene == scenes[-1] else ()))
+    return tables
 
 
 def _cells(one: Summary, wide: bool) -> dict[str, str]:
@@ -119,10 +124,9 @@ def nonlinear_tables(summaries: Sequence[NonlinearSummary], flights: str, wide: 
         f"Thread-CPU milliseconds; gain: time of {OSQP!r} over this one's, median [95 %] of the programs.",
         machine(),
     )
-    scenes = list(dict.fromkeys(one.scene for one in summaries))
-    shown = []
-    for scene in scenes:
-        cells = [
+    lines = [
+        (
+            one.scene,
             {
                 "program": one.contender,
                 "programs": str(one.programs),
@@ -135,13 +139,11 @@ def nonlinear_tables(summaries: Sequence[NonlinearSummary], flights: str, wide: 
                 "median": f"{1e-3 * one.median_us:.3g}",
                 **({"p95": f"{1e-3 * one.p95_us:.3g}", "max": f"{1e-3 * one.max_us:.3g}"} if wide else {}),
                 "gain": _ratio(one.gain, wide),
-            }
-            for one in summaries
-            if one.scene == scene
-        ]
-        lines = tuple(tuple(line.values()) for line in cells)
-        shown.append(Rows(scene, tuple(cells[0]), lines, notes if scene == scenes[-1] else ()))
-    return shown
+            },
+        )
+        for one in summaries
+    ]
+    return _by_scene(lines, notes)
 
 
 def planner_tables(rows: Sequence[PlannerRow], flights: str) -> list[Rows]:
@@ -154,10 +156,9 @@ def planner_tables(rows: Sequence[PlannerRow], flights: str) -> list[Rows]:
         "planner's part of it.",
         machine(),
     )
-    scenes = list(dict.fromkeys(row.scene for row in rows))
-    shown = []
-    for scene in scenes:
-        cells = [
+    lines = [
+        (
+            row.scene,
             {
                 "planner": row.planner,
                 "steps": str(row.steps),
@@ -169,13 +170,11 @@ def planner_tables(rows: Sequence[PlannerRow], flights: str) -> list[Rows]:
                 "mission (ms)": f"{row.mission_ms:.1f}",
                 "missions/s": f"{1e3 / row.mission_ms:.1f}",
                 "planning": f"{row.planning:.0%}",
-            }
-            for row in rows
-            if row.scene == scene
-        ]
-        lines = tuple(tuple(line.values()) for line in cells)
-        shown.append(Rows(scene, tuple(cells[0]), lines, notes if scene == scenes[-1] else ()))
-    return shown
+            },
+        )
+        for row in rows
+    ]
+    return _by_scene(lines, notes)
 
 
 def scaling_tables(
