@@ -360,13 +360,29 @@ def _without_interrupts() -> Iterator[None]:
 
     from joblib.externals.loky.backend import resource_tracker as loky_resource_tracker
 
-    resource_tracker.ensure_running()
-    loky_resource_tracker.ensure_running()
+    with _set("PYTHONWARNINGS", "ignore:resource_tracker:UserWarning"):
+        # A stop may leave something for them to tidy up, which is no news to whoever stopped.
+        resource_tracker.ensure_running()
+        loky_resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def _set(name: str, value: str) -> Iterator[None]:
+    """Set a variable of the environment for processes that start meanwhile."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+        else:
+            os.environ[name] = before
 
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h

@@ -172,6 +172,26 @@ def test_a_stop_comes_for_certain_whatever_hangs(signum: signal.Signals) -> None
     assert (process.returncode, stderr) == (128 + signum, "stopped\n")
 
 
+LEAKY = """
+import os
+from multiprocessing import resource_tracker as ours
+from joblib.externals.loky.backend import resource_tracker as lokys
+from napf_mpc.workers import _without_interrupts
+with _without_interrupts():
+    pass
+assert "PYTHONWARNINGS" not in os.environ
+for tracker, kind in ((ours, "semaphore"), (lokys, "semlock")):
+    tracker.register("/not_there_any_more", kind)
+os._exit(130)
+"""
+
+
+def test_what_a_stop_leaves_is_tidied_up_without_a_word() -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONWARNINGS"}
+    done = subprocess.run([sys.executable, "-c", LEAKY], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
 def test_a_stop_without_an_output_folder_says_that_nothing_is_kept(tmp_path: Path) -> None:
     words = command(tmp_path / "out", "--workers", "1")
     words[words.index("montecarlo")] = "compare"
