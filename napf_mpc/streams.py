@@ -29,6 +29,10 @@ class Stream(IntEnum):
     MOVING_ACCELERATION = 10
     MOVING_OBSERVATION = 11
     RARE_EVENT = 12
+    GNSS_START = 13
+    GNSS_COMMON = 14
+    GNSS_WAVES = 15
+    GNSS_NOISE = 16
 
 
 class Numbers(Protocol):

@@ -26,7 +26,7 @@ from napf_mpc.navigation import cross_covariance, kalman
 from napf_mpc.navigation.forecast import CovarianceForecast, ForecastModel, drifts
 from napf_mpc.navigation.sensors import bias_memory
 from napf_mpc.navigation.solution import NavSolution
-from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Recorded
+from napf_mpc.problem import ConstantBias, GaussMarkov, Gnss, Navigation, Recorded
 
 __all__ = ["GATE_PATIENCE_S", "RECEIVER_NOISE_M", "FilterModel", "KalmanFilter"]
 
@@ -61,6 +61,8 @@ class FilterModel:
     """(3,) axes that are measured without a fix too (a barometer's)."""
     coupled: bool
     """Whether fixes report covariances between axes."""
+    shares_of_fixes: bool
+    """Whether what UAVs have in common is taken from each epoch's fixes, not from ``common_share``."""
     velocity_sigma_mps: float
     """Sigma of the GNSS velocity [m/s]."""
     bias_sigma_mps2: float
@@ -86,7 +88,7 @@ class FilterModel:
                 times = [navigation.correlation_time_s if own is None else own] * 3
             case ConstantBias():
                 times = [math.inf if own is None else own] * 3
-            case Recorded():
+            case Recorded() | Gnss():
                 assert own is not None
                 times = [own] * 3
         barometer = isinstance(navigation, Recorded) and navigation.vertical == "barometer"
@@ -101,7 +103,8 @@ class FilterModel:
             error_noise=-np.expm1(-2.0 * lags),
             common_share=share,
             fixless_axis=np.array([False, False, barometer]),
-            coupled=isinstance(navigation, Recorded),
+            coupled=isinstance(navigation, Recorded | Gnss),
+            shares_of_fixes=isinstance(navigation, Gnss),
             velocity_sigma_mps=navigation.gnss_velocity_sigma_mps,
             bias_sigma_mps2=navigation.accelerometer_bias_mps2,
             bias_memory=bias_memory(navigation, period_s),
@@ -160,10 +163,12 @@ class KalmanFilter:
         self._sigma = np.full((runs, uavs, 3), np.nan)
         self._epochs_since_new, self._epochs_per_new = 0, 1
 
-        shared = bool(model.common_share.any()) and 1 < uavs <= cross_covariance.MAX_UAVS
+        shared = (model.shares_of_fixes or bool(model.common_share.any())) and 1 < uavs <= cross_covariance.MAX_UAVS
         kept = runs if shared or model.coupled else 0
         self._carried = np.empty((kept, uavs, 3, kalman.STATES, kalman.STATES))
         self._response = np.empty((kept, uavs, 3, kalman.STATES))
+        pairs = (runs if shared else 0, 3, uavs, uavs)
+        self._share = np.broadcast_to(model.common_share[:, None, None], pairs).copy()
         self._common = np.zeros((runs if shared else 0, 3, uavs, uavs, kalman.STATES, kalman.STATES))
         self._cross = np.zeros((runs if model.coupled else 0, uavs, 3, kalman.STATES, kalman.STATES))
         tick = kalman.drift(model.period_s, model.bias_memory)
@@ -202,7 +207,14 @@ class KalmanFilter:
         self._age += 1
 
     def correct(
-        self, position: Array, velocity: Array, covariance: Array, available: Mask, new: bool, active: Mask
+        self,
+        position: Array,
+        velocity: Array,
+        covariance: Array,
+        available: Mask,
+        new: bool,
+        active: Mask,
+        common_factor: Array | None = None,
     ) -> None:
         """Take in one epoch of fixes. Epochs come at their rate, also while there is no fix.
 
@@ -218,6 +230,8 @@ class KalmanFilter:
             Whether the fix is a new one; one that the receiver repeats says nothing new.
         active : array of bool, shape (run,)
             Runs that fly.
+        common_factor : array, shape (run, uav, 3, rank), optional
+            Factor of what the fixes of UAVs have in common [m], where the model takes that from fixes.
         """
         model = self._model
         variance = np.einsum("...ii->...i", covariance)
@@ -253,6 +267,9 @@ class KalmanFilter:
         if new:
             self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
         self._note_verdict(available, active)
+        if model.shares_of_fixes and common_factor is not None and len(self._common):
+            scaled = common_factor / np.where(sigma > 0.0, sigma, np.inf)[..., None]
+            self._share = np.ascontiguousarray(np.einsum("riak,rjak->raij", scaled, scaled))
         self._advance_covariances(covariance, sigma, active)
 
     def _note_verdict(self, available: Mask, active: Mask) -> None:
@@ -272,7 +289,7 @@ class KalmanFilter:
         if len(self._common):
             begun = self._verdict == kalman.BEGUN
             cross_covariance.advance_pairs(
-                self._common, self._carried, self._response, self._model.common_share, begun, active
+                self._common, self._carried, self._response, self._share, begun, active
             )
             self._common_factor = np.zeros_like(self._common_factor)
             cross_covariance.factorise(self._common, self._common_factor)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation.filter import FilterModel, KalmanFilter
-from napf_mpc.navigation.fix import PositionErrors
+from napf_mpc.navigation.fix import PlacedErrors, PositionErrors, fixes_of_flight
 from napf_mpc.navigation.replay import RecordedErrors
 from napf_mpc.navigation.sensors import Sensors
 from napf_mpc.navigation.solution import NavSolution
@@ -28,7 +28,7 @@ class FilteredNavigation:
     ----------
     navigation : Navigation
         Sensors and filter.
-    errors : PositionErrors
+    errors : PositionErrors or PlacedErrors
         Of the position fixes.
     seed : int or Numbers
         Campaign seed, or what stands for it.
@@ -45,7 +45,7 @@ class FilteredNavigation:
     def __init__(
         self,
         navigation: Navigation,
-        errors: PositionErrors,
+        errors: PositionErrors | PlacedErrors,
         seed: Seed,
         runs: range,
         period_s: float,
@@ -54,6 +54,7 @@ class FilteredNavigation:
     ) -> None:
         uavs = velocity.shape[1]
         self._errors = errors
+        self._fixes = fixes_of_flight(errors)
         self._ticks_per_fix = ticks_per_fix
         self._sensors = Sensors(navigation, seed, runs, uavs, period_s, velocity)
         self._filter = KalmanFilter(
@@ -91,7 +92,7 @@ class FilteredNavigation:
             self._filter.predict(self._sensors.velocity_change(velocity), active)
         if tick % self._ticks_per_fix == 0:
             epoch = tick // self._ticks_per_fix
-            fix = self._errors.fix(epoch)
+            fix = self._fixes.fix(epoch, position)
             self._filter.correct(
                 position + fix.error,
                 self._sensors.gnss_velocity(velocity),
@@ -99,11 +100,12 @@ class FilteredNavigation:
                 fix.available,
                 _is_new(self._errors, epoch),
                 active,
+                fix.common_factor,
             )
         return self._filter.solution(time_s, attitude.copy(), body_rates.copy())
 
 
-def _is_new(errors: PositionErrors, epoch: int) -> bool:
+def _is_new(errors: PositionErrors | PlacedErrors, epoch: int) -> bool:
     """Whether an epoch's fix is more than the last one repeated: a log slower than the fixes is held."""
     if epoch == 0 or not isinstance(errors, RecordedErrors):
         return True

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["COAST_SIGMA_MPS", "Fix", "PositionErrors", "coasting_variance", "diagonal"]
+__all__ = [
+    "COAST_SIGMA_MPS",
+    "Fix",
+    "FixSource",
+    "PlacedErrors",
+    "PositionErrors",
+    "coasting_variance",
+    "diagonal",
+    "fixes_of_flight",
+]
 
 Array = NDArray[np.float64]
 
@@ -51,6 +60,40 @@ class PositionErrors(Protocol):
 
     def fix(self, epoch: int) -> Fix:
         """Return the fix of an epoch; epoch 0 is at t = 0."""
+
+
+class FixSource(Protocol):
+    """Fixes of one flight, asked for epoch by epoch."""
+
+    def fix(self, epoch: int, position: Array) -> Fix:
+        """Return the fix of the next epoch, at the true places (run, uav, 3) [m]."""
+
+
+class PlacedErrors(Protocol):
+    """Position errors that depend on the true places, as those of an emulated receiver."""
+
+    @property
+    def period_s(self) -> float:
+        """Time between two epochs [s]."""
+
+    def begin(self) -> FixSource:
+        """Return the fixes of one flight, from epoch 0 on; each flight meets the same errors."""
+
+
+class _DrawnFixes:
+    """Fixes whose errors were drawn beforehand, wherever the UAVs are."""
+
+    def __init__(self, errors: PositionErrors) -> None:
+        self._errors = errors
+
+    def fix(self, epoch: int, position: Array) -> Fix:
+        return self._errors.fix(epoch)
+
+
+def fixes_of_flight(errors: PositionErrors | PlacedErrors) -> FixSource:
+    """Return the fixes of one flight, whatever its errors depend on."""
+    begin = getattr(errors, "begin", None)
+    return _DrawnFixes(cast(PositionErrors, errors)) if begin is None else cast(FixSource, begin())
 
 
 def coasting_variance(age_s: Array) -> Array:
