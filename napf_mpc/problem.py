@@ -681,6 +681,8 @@ class Gnss(_NavigationBase):
     """Mean loss of such a signal; what falls under the mask is not used."""
     reflected_loss_sigma_db: float = Field(4.0, ge=0.0, le=20.0)
     """Sigma of that loss."""
+    believed_reflection_m: float = Field(2.0, ge=0.0, le=1e3)
+    """What the receiver believes of reflections: sigma at 45 dB Hz, in its weights and its covariance; tenfold for 20 dB less. 0 for one that counts on signals in sight alone."""  # noqa: E501
     weighting: Literal["plain", "huber", "cauchy"] = "huber"
     """Weights of the solution: by elevation and C/N0, and by Huber's or Cauchy's function of residuals."""
     fault_exclusion: Literal["none", "residuals"] = "residuals"
@@ -689,8 +691,8 @@ class Gnss(_NavigationBase):
     """Probability of a test of residuals to fail without a fault."""
     max_pdop: float = Field(20.0, ge=1.0, le=1e6)
     """Position dilution of precision above which there is no fix."""
-    filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] = 10.0
-    """Filter: correlation time that it assumes of the fix's error."""
+    filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] = 2.0
+    """Filter: correlation time that it assumes of the error but for what UAVs have in common, which lasts."""
     credit: str = Field("", max_length=500)
     """Source and licence, printed on every figure."""
 

@@ -55,7 +55,12 @@ HOMES = {
     "highspy": {"solvers/qpsolvers_.py"},
     "numba": {"jit.py"},
     "casadi": {"vehicle/quadrotor.py", "vehicle/codegen.py", "solvers/casadi_.py", "benchmark/nmpc.py"},
-    "pymap3d": {"navigation/recorded.py", "world/city.py"},
+    "pymap3d": {
+        "navigation/recorded.py",
+        "navigation/sky.py",
+        "navigation/pseudoranges.py",
+        "world/city.py",
+    },
     "pyarrow": {"store.py"},
     "matplotlib": {"plot/"},
     "PIL": {"plot/"},

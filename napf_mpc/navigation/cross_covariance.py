@@ -42,9 +42,8 @@ def advance_pairs(
         the diagonal of the UAVs it is the part of a UAV's own covariance that has this cause.
     carried, response : array, shapes (run, uav, 3, 4, 4) and (run, uav, 3, 4)
         From :func:`napf_mpc.navigation.kalman.correct`.
-    share : array, shape (run, 3, uav, uav)
-        Correlation of the errors of two UAVs' fixes on each axis; on the diagonal of the UAVs, the share of
-        the variance that is common.
+    share : array, shape (3,)
+        Share of the variance of each axis' error that is common.
     begun : array of bool, shape (run, uav)
         UAVs whose filter began at this epoch. With one that did not, it shares nothing yet.
     active : array of bool, shape (run,)
@@ -55,17 +54,17 @@ def advance_pairs(
         if not active[r]:
             continue
         for a in range(3):
+            if share[a] == 0.0:
+                continue
             for i in range(common.shape[2]):
                 for j in range(i, common.shape[2]):
                     m = common[r, a, i, j]
-                    if share[r, a, i, j] == 0.0 and not m.any():
-                        continue
                     if begun[r, i] != begun[r, j]:
                         m[:] = 0.0
                     else:
                         _advance(
                             m, carried[r, i, a], carried[r, j, a], response[r, i, a], response[r, j, a],
-                            share[r, a, i, j], half,
+                            share[a], half,
                         )  # fmt: skip
 
 

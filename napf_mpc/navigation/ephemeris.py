@@ -178,9 +178,7 @@ class Ephemerides:
         mean = self.m0 + (np.sqrt(_GRAVITY[self.system]) / self.sqrt_a**3 + self.delta_n) * tk
         anomaly = mean
         for _ in range(_KEPLER_STEPS):
-            anomaly = anomaly - (anomaly - self.e * np.sin(anomaly) - mean) / (
-                1.0 - self.e * np.cos(anomaly)
-            )
+            anomaly = anomaly - (anomaly - self.e * np.sin(anomaly) - mean) / (1.0 - self.e * np.cos(anomaly))
         return np.sin(anomaly), np.cos(anomaly)
 
     def at(self, time_s: float) -> BroadcastConstellation:

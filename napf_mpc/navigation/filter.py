@@ -8,7 +8,8 @@ that accelerometers measured. It takes as known
 - the laws of the GNSS velocity's noise, of the accelerometer's noise and of its bias, as the problem gives
   them;
 - attitude, and with it gravity in the body, without error;
-- the common-mode share, for what it reports of two UAVs.
+- the common-mode share, for what it reports of two UAVs. (What emulated receivers have in common lasts for
+  the mission and is kept out of the filter, see :mod:`napf_mpc.navigation.filtered`.)
 
 The axes are filtered apart. Where a fix reports a covariance between axes, that is not used to estimate, but
 carried through the gains that are, so the reported covariance has it.
@@ -61,8 +62,6 @@ class FilterModel:
     """(3,) axes that are measured without a fix too (a barometer's)."""
     coupled: bool
     """Whether fixes report covariances between axes."""
-    shares_of_fixes: bool
-    """Whether what UAVs have in common is taken from each epoch's fixes, not from ``common_share``."""
     velocity_sigma_mps: float
     """Sigma of the GNSS velocity [m/s]."""
     bias_sigma_mps2: float
@@ -104,7 +103,6 @@ class FilterModel:
             common_share=share,
             fixless_axis=np.array([False, False, barometer]),
             coupled=isinstance(navigation, Recorded | Gnss),
-            shares_of_fixes=isinstance(navigation, Gnss),
             velocity_sigma_mps=navigation.gnss_velocity_sigma_mps,
             bias_sigma_mps2=navigation.accelerometer_bias_mps2,
             bias_memory=bias_memory(navigation, period_s),
@@ -163,12 +161,10 @@ class KalmanFilter:
         self._sigma = np.full((runs, uavs, 3), np.nan)
         self._epochs_since_new, self._epochs_per_new = 0, 1
 
-        shared = (model.shares_of_fixes or bool(model.common_share.any())) and 1 < uavs <= cross_covariance.MAX_UAVS
+        shared = bool(model.common_share.any()) and 1 < uavs <= cross_covariance.MAX_UAVS
         kept = runs if shared or model.coupled else 0
         self._carried = np.empty((kept, uavs, 3, kalman.STATES, kalman.STATES))
         self._response = np.empty((kept, uavs, 3, kalman.STATES))
-        pairs = (runs if shared else 0, 3, uavs, uavs)
-        self._share = np.broadcast_to(model.common_share[:, None, None], pairs).copy()
         self._common = np.zeros((runs if shared else 0, 3, uavs, uavs, kalman.STATES, kalman.STATES))
         self._cross = np.zeros((runs if model.coupled else 0, uavs, 3, kalman.STATES, kalman.STATES))
         tick = kalman.drift(model.period_s, model.bias_memory)
@@ -207,14 +203,7 @@ class KalmanFilter:
         self._age += 1
 
     def correct(
-        self,
-        position: Array,
-        velocity: Array,
-        covariance: Array,
-        available: Mask,
-        new: bool,
-        active: Mask,
-        common_factor: Array | None = None,
+        self, position: Array, velocity: Array, covariance: Array, available: Mask, new: bool, active: Mask
     ) -> None:
         """Take in one epoch of fixes. Epochs come at their rate, also while there is no fix.
 
@@ -230,8 +219,6 @@ class KalmanFilter:
             Whether the fix is a new one; one that the receiver repeats says nothing new.
         active : array of bool, shape (run,)
             Runs that fly.
-        common_factor : array, shape (run, uav, 3, rank), optional
-            Factor of what the fixes of UAVs have in common [m], where the model takes that from fixes.
         """
         model = self._model
         variance = np.einsum("...ii->...i", covariance)
@@ -267,9 +254,6 @@ class KalmanFilter:
         if new:
             self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
         self._note_verdict(available, active)
-        if model.shares_of_fixes and common_factor is not None and len(self._common):
-            scaled = common_factor / np.where(sigma > 0.0, sigma, np.inf)[..., None]
-            self._share = np.ascontiguousarray(np.einsum("riak,rjak->raij", scaled, scaled))
         self._advance_covariances(covariance, sigma, active)
 
     def _note_verdict(self, available: Mask, active: Mask) -> None:
@@ -289,7 +273,7 @@ class KalmanFilter:
         if len(self._common):
             begun = self._verdict == kalman.BEGUN
             cross_covariance.advance_pairs(
-                self._common, self._carried, self._response, self._share, begun, active
+                self._common, self._carried, self._response, self._model.common_share, begun, active
             )
             self._common_factor = np.zeros_like(self._common_factor)
             cross_covariance.factorise(self._common, self._common_factor)

@@ -1,14 +1,23 @@
-"""Filtered navigation in the closed loop: sensors see the truth, the filter sees the sensors."""
+"""Filtered navigation in the closed loop: sensors see the truth, the filter sees the sensors.
+
+Of an emulated receiver's errors the part that UAVs have in common (orbits, clocks, atmosphere) stays as it is
+for minutes. No filter can take it out, and one that believed the whole error to change would soon claim to have
+done so. The filter is therefore given the covariance of the rest, S C S^T - L L^T, and L L^T is added to what it
+reports: a Schmidt-Kalman filter's treatment of a constant, but for gains that ignore it. The same L is the common
+factor of the UAVs.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation.filter import FilterModel, KalmanFilter
 from napf_mpc.navigation.fix import PlacedErrors, PositionErrors, fixes_of_flight
+from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.replay import RecordedErrors
 from napf_mpc.navigation.sensors import Sensors
 from napf_mpc.navigation.solution import NavSolution
@@ -55,6 +64,9 @@ class FilteredNavigation:
         uavs = velocity.shape[1]
         self._errors = errors
         self._fixes = fixes_of_flight(errors)
+        self._lasting: Array | None = None
+        if isinstance(errors, GnssErrors):
+            self._lasting = np.zeros((*velocity.shape[:2], 3, len(errors.scene.names)))
         self._ticks_per_fix = ticks_per_fix
         self._sensors = Sensors(navigation, seed, runs, uavs, period_s, velocity)
         self._filter = KalmanFilter(
@@ -93,16 +105,33 @@ class FilteredNavigation:
         if tick % self._ticks_per_fix == 0:
             epoch = tick // self._ticks_per_fix
             fix = self._fixes.fix(epoch, position)
+            covariance = fix.covariance
+            if self._lasting is not None:
+                self._lasting = np.where(fix.available[..., None, None], fix.common_factor, self._lasting)
+                covariance = covariance - _square(fix.common_factor)
             self._filter.correct(
                 position + fix.error,
                 self._sensors.gnss_velocity(velocity),
-                fix.covariance,
+                covariance,
                 fix.available,
                 _is_new(self._errors, epoch),
                 active,
-                fix.common_factor,
             )
-        return self._filter.solution(time_s, attitude.copy(), body_rates.copy())
+        found = self._filter.solution(time_s, attitude.copy(), body_rates.copy())
+        return found if self._lasting is None else _with_lasting(found, self._lasting)
+
+
+def _square(factor: Array) -> Array:
+    """L L^T of factors (..., 3, rank)."""
+    return np.einsum("...ak,...bk->...ab", factor, factor)
+
+
+def _with_lasting(found: NavSolution, factor: Array) -> NavSolution:
+    """Add what no filter can take out, an error that stays for the mission, to a filter's report."""
+    lasting = _square(factor)
+    covariance = found.covariance.copy()
+    covariance[..., :3, :3] += lasting
+    return replace(found, covariance=covariance, common_factor=factor, lasting=lasting)
 
 
 def _is_new(errors: PositionErrors | PlacedErrors, epoch: int) -> bool:

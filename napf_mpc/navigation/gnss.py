@@ -10,8 +10,8 @@ The error of a pseudorange is, for satellite s and UAV i,
 with a, b, c standard normal once a mission (they change over hours), z white, g a field over place and time
 (:mod:`napf_mpc.navigation.wave_field`), and d >= 0 an exponential extra path that is such a field, too. A
 satellite that buildings hide arrives by reflection, weaker by a loss that varies from place to place; what is
-weaker than the mask is not received. The receiver knows elevation and C/N0, from which it takes its sigmas,
-but not what is reflected.
+weaker than the mask is not received. The receiver knows elevation and C/N0, but not what is reflected. It
+takes its sigmas from the laws above, and for reflections, which come weak, adds a sigma that grows as C/N0 falls.
 
 The receiver's clock adds the same to all ranges of a system and is solved for, so it drops out to rounding
 and is left out here. So do group delays and all that a satellite's own clock does: who is told the true
@@ -150,7 +150,7 @@ class GnssScene:
         drawn = parts * self.common
         low, high = cfg.carrier_to_noise_dbhz
         strength = np.zeros(noise.shape)
-        error, sigma = np.zeros(noise.shape), np.zeros(noise.shape)
+        error = np.zeros(noise.shape)
         tracked = np.zeros(noise.shape, dtype=np.bool_)
         _receive(
             np.ascontiguousarray(position), time_s, noise, above, in_sight,
@@ -161,13 +161,16 @@ class GnssScene:
             np.ascontiguousarray(drawn[..., 0] + drawn[..., 1] + drawn[..., 2]),
             *self.fields, strength, error, tracked,
         )  # fmt: skip
-        own = code_noise_sigma_m(strength, cfg.code_noise_m) ** 2
-        own = own + (cfg.multipath_scale * multipath_sigma_m(elevation))[:, None] ** 2
-        sigma[...] = np.where(tracked, np.sqrt(shared[:, None] ** 2 + own), 0.0)
-        # A receiver's model of no error at all would make weights without end.
-        sigma[...] = np.where(tracked, np.maximum(sigma, 1e-3), 0.0)
+        white = code_noise_sigma_m(strength, cfg.code_noise_m)
         # The kernel leaves the white noise to here, where its sigma is known.
-        error += np.where(tracked, code_noise_sigma_m(strength, cfg.code_noise_m) * noise, 0.0)
+        error += np.where(tracked, white * noise, 0.0)
+        believed = (
+            shared[:, None] ** 2
+            + white**2
+            + (cfg.multipath_scale * multipath_sigma_m(elevation))[:, None] ** 2
+            + code_noise_sigma_m(strength, cfg.believed_reflection_m) ** 2
+        )
+        sigma = np.where(tracked, np.sqrt(believed), 0.0)
         return Observation(unit, in_sight, tracked, strength, error, sigma, shared)
 
 

@@ -131,7 +131,9 @@ class GnssFixes:
             before = solve_observation(wide, scene, SolverSettings("plain", exclude=False, max_pdop=1e6))
             self._error = before.offset.reshape(*shape, 3)
             self._covariance = before.covariance.reshape(*shape, 3, 3)
-        excess = np.where(self.check == Check.FAULTY, np.nan_to_num(found.excess.reshape(shape), nan=1.0), 1.0)
+        excess = np.where(
+            self.check == Check.FAULTY, np.nan_to_num(found.excess.reshape(shape), nan=1.0), 1.0
+        )
         fresh = found.covariance.reshape(*shape, 3, 3) * np.maximum(excess, 1.0)[..., None, None]
         self._error = np.where(available[..., None], found.offset.reshape(*shape, 3), self._error)
         self._covariance = np.where(available[..., None, None], fresh, self._covariance)

@@ -161,9 +161,5 @@ def _table(records: list[tuple[str, dict[str, float], float]]) -> Ephemerides:
         toc_s=np.array([toc for _, _, toc in records]),
         toe_s=column("week") * 604_800.0 + column("toe"),
         healthy=column("health") == 0.0,
-        **{
-            key: column(key)
-            for key in _PLACES
-            if key not in ("toe", "source", "week", "health")
-        },
+        **{key: column(key) for key in _PLACES if key not in ("toe", "source", "week", "health")},
     )

@@ -47,6 +47,8 @@ class NavSolution:
     """Moving obstacles as tracked now; None in a world without any."""
     forecast: CovarianceForecast | None = None
     """What the filter knows of its covariance to come; None if the law of the errors is not known."""
+    lasting: Array | None = None
+    """(run, uav, 3, 3) part of the position's covariance that stays whatever is measured [m^2]; None for none."""
 
     @property
     def position_covariance(self) -> Array:
@@ -85,7 +87,11 @@ class NavSolution:
         out = np.repeat(self.position_covariance[:, :, None], len(ahead_s), axis=2)
         if self.forecast is not None:
             scale = np.sqrt(self.forecast.change(ahead_s, with_fixes))
+            if self.lasting is not None:
+                out -= self.lasting[:, :, None]
             out *= scale[..., :, None] * scale[..., None, :]
+            if self.lasting is not None:
+                out += self.lasting[:, :, None]
         return out
 
     def trusted(self) -> NDArray[np.bool_]:

@@ -65,7 +65,5 @@ def field_value(vector: Array, rate: Array, phase: Array, x: float, y: float, z:
     """
     total = 0.0
     for k in range(len(rate)):
-        total += math.cos(
-            vector[k, 0] * x + vector[k, 1] * y + vector[k, 2] * z + rate[k] * t + phase[k]
-        )
+        total += math.cos(vector[k, 0] * x + vector[k, 1] * y + vector[k, 2] * z + rate[k] * t + phase[k])
     return math.sqrt(2.0 / len(rate)) * total

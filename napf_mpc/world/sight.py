@@ -50,9 +50,7 @@ def line_of_sight(
     array = obstacles.check_points("points", points)
     rays = np.ascontiguousarray(directions, dtype=np.float64)
     if rays.ndim != 3 or rays.shape[2] != 3 or rays.shape[0] not in (1, array.shape[0]):
-        raise ValueError(
-            f"directions has shape {rays.shape}, must be (1 or {array.shape[0]} runs, ray, 3)"
-        )
+        raise ValueError(f"directions has shape {rays.shape}, must be (1 or {array.shape[0]} runs, ray, 3)")
     if not np.isfinite(rays).all():
         raise ValueError("directions holds numbers that are not finite")
     asked = np.ones(rays.shape[:2], dtype=np.bool_) if wanted is None else np.ascontiguousarray(wanted)
@@ -79,9 +77,7 @@ def _see_all(
 
 
 @compiled
-def _blocked(
-    solids: Solids, tree: BoxTree, scene: int, p: Array, u: Array, nodes: NDArray[np.int64]
-) -> bool:
+def _blocked(solids: Solids, tree: BoxTree, scene: int, p: Array, u: Array, nodes: NDArray[np.int64]) -> bool:
     """Whether any solid of a scene meets a ray."""
     depth = 0
     if tree.root[scene] >= 0:
@@ -132,7 +128,9 @@ def _meets_solid(solids: Solids, i: int, p: Array, u: Array) -> bool:
     dx, dy = p[0] - row[X], p[1] - row[Y]
     if kind == SPHERE:
         dz = p[2] - row[BASE]
-        return _meets_ball(dx * u[0] + dy * u[1] + dz * u[2], dx * dx + dy * dy + dz * dz, 1.0, row[A], 0.0, FAR_M)
+        return _meets_ball(
+            dx * u[0] + dy * u[1] + dz * u[2], dx * dx + dy * dy + dz * dz, 1.0, row[A], 0.0, FAR_M
+        )
     near, far = _between(p[2], u[2], row[BASE], row[TOP], 0.0, FAR_M)
     if near > far:
         return False
@@ -146,7 +144,9 @@ def _meets_solid(solids: Solids, i: int, p: Array, u: Array) -> bool:
         near, far = _between(x, ux, -row[A], row[A], near, far)
         near, far = _between(y, uy, -row[B], row[B], near, far)
         return near <= far
-    return _meets_footprint(solids, i, p[0] + near * u[0], p[1] + near * u[1], (far - near) * u[0], (far - near) * u[1])
+    return _meets_footprint(
+        solids, i, p[0] + near * u[0], p[1] + near * u[1], (far - near) * u[0], (far - near) * u[1]
+    )
 
 
 @compiled
