@@ -2,8 +2,8 @@
 
     python benchmarks/berlin_pseudoranges.py --data DIR
 
-Data: smartLoc, Berlin Potsdamer Platz (TU Chemnitz, CC BY-SA 4.0), 1372 epochs of GPS and GLONASS, sigmas as the
-receiver gives them. One clock a system. Epochs are correlated (0.6-0.8 at 5 s): no independent trials.
+Data: smartLoc, Berlin Potsdamer Platz (TU Chemnitz, CC BY-SA 4.0), 1372 epochs of GPS and GLONASS, sigmas as
+the receiver gives them. One clock a system. Epochs are correlated (0.6-0.8 at 5 s): no independent trials.
 """
 
 import argparse
@@ -94,7 +94,8 @@ def main() -> None:
         up = np.abs(error[:, 2]) < 3.0 * np.sqrt(covariance[:, 2, 2])
         print(
             f"| {name} | {len(error)}/{epochs} | {np.median(across):.1f} / {np.quantile(across, 0.95):.1f} "
-            f"| {error[:, 0].mean():+.1f}, {error[:, 2].mean():+.1f} | {100 * np.mean(across < 3 * drms):.1f} % "
+            f"| {error[:, 0].mean():+.1f}, {error[:, 2].mean():+.1f} "
+            f"| {100 * np.mean(across < 3 * drms):.1f} % "
             f"| {100 * np.mean(up):.1f} % "
             f"| {np.sum(check == Check.UNCHECKED)}, {np.sum(check == Check.FAULTY)} |"
         )

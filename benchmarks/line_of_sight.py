@@ -1,9 +1,10 @@
-"""Line of sight from ten thousand points to all satellites among the buildings of Nishi-Shinjuku: time and growth.
+"""Line of sight from ten thousand points to all satellites among the buildings of Nishi-Shinjuku: its time.
 
     python benchmarks/line_of_sight.py --data DIR
 
-Points are uniform over 1.2 km x 1.2 km and from 5 to 240 m high (free or not), satellites those of the broadcast
-ephemerides on 2023-07-11 at noon, GPS time, above 10 degrees. Subsets of the buildings are drawn at random.
+Points are uniform over 1.2 km x 1.2 km and from 5 to 240 m high (free or not), satellites those of the
+broadcast ephemerides on 2023-07-11 at noon, GPS time, above 10 degrees. Subsets of the buildings are drawn at
+random.
 """
 
 import argparse

@@ -2,9 +2,9 @@
 
     python benchmarks/urban_geometry.py --data DIR [--points N]
 
-Free points are drawn uniformly over 1 km x 1 km about the city hall, moments uniformly over 2023-07-11 (GPS time);
-GPS, Galileo and QZSS above 10 degrees and in line of sight. One clock for GPS and QZSS, one for Galileo. Solvable:
-satellites >= 3 + clocks and PDOP <= 100. The last column takes one clock for all systems.
+Free points are drawn uniformly over 1 km x 1 km about the city hall, moments uniformly over 2023-07-11 (GPS
+time); GPS, Galileo and QZSS above 10 degrees and in line of sight. One clock for GPS and QZSS, one for Galileo.
+Solvable: satellites >= 3 + clocks and PDOP <= 100. The last column takes one clock for all systems.
 """
 
 import argparse
@@ -35,7 +35,9 @@ def at_height(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Satellites (point,), and HDOP, VDOP, PDOP (point, 3) with two clocks and with one."""
     stream = generator(seed, round(height_m), Stream.SCENE)
-    seen, two, one = [], [], []
+    seen: list[float] = []
+    two: list[NDArray[np.float64]] = []
+    one: list[NDArray[np.float64]] = []
     while len(seen) < count:
         place = np.array([[[*stream.uniform(-HALF_M, HALF_M, 2), height_m]]])
         time_s = gps_seconds(dt.datetime(2023, 7, 11)) + 86_400.0 * stream.uniform()
@@ -49,7 +51,7 @@ def at_height(
         for kept, clocks in ((two, clock), (one, np.zeros_like(clock))):
             found = solve(unit, clocks, zero, unity, free, _PLAIN)
             kept.append(np.full(3, np.nan) if found.check[0] == Check.NONE else found.dop[0])
-        seen.append(free.sum())
+        seen.append(float(free.sum()))
     return np.array(seen, dtype=np.float64), np.array(two), np.array(one)
 
 
@@ -69,9 +71,7 @@ def main() -> None:
     city = load_city(world, options.data)
     records = read_rinex_navigation(options.data / "gnss_nagoya_spp" / "broadcast.nav")
     print(f"N = {options.points} points a height, seed {options.seed}")
-    print(
-        "| height m | satellites mean (min) | solvable | HDOP median / 95 % | VDOP median / 95 % | one clock |"
-    )
+    print("| height m | satellites (min) | solvable | HDOP median / 95 % | VDOP median / 95 % | one clock |")
     print("| --- | --- | --- | --- | --- | --- |")
     for height in (5.0, 20.0, 60.0, 120.0, 240.0):
         seen, two, one = at_height(city, records, height, options.points, options.seed)
@@ -79,7 +79,8 @@ def main() -> None:
         h, v = two[solved, 0], two[solved, 1]
         print(
             f"| {height:g} | {seen.mean():.1f} ({seen.min():.0f}) | {100 * solved.mean():.0f} % "
-            f"| {np.median(h):.2f} / {np.quantile(h, 0.95):.2f} | {np.median(v):.2f} / {np.quantile(v, 0.95):.2f} "
+            f"| {np.median(h):.2f} / {np.quantile(h, 0.95):.2f} "
+            f"| {np.median(v):.2f} / {np.quantile(v, 0.95):.2f} "
             f"| {100 * alone.mean():.0f} %, {np.median(one[alone, 0]):.2f}, {np.median(one[alone, 1]):.2f} |"
         )
 

@@ -644,7 +644,7 @@ class Gnss(_NavigationBase):
     start_gps_time: str = Field("2023-07-11T00:00:00", max_length=40)
     """GPS time of the mission's start, or of the earliest start."""
     start_spread_h: float = Field(24.0, ge=0.0, le=240.0)
-    """Each run starts at a random time up to this long after ``start_gps_time``; 0 for always the same sky."""
+    """Each run starts at a random time up to this long after ``start_gps_time``; 0 for one sky always."""
     origin_latitude_deg: Annotated[float, Field(ge=-89.9, le=89.9)] | None = None
     """Latitude of the local frame's origin; by default a city's own, else 50."""
     origin_longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0)] | None = None

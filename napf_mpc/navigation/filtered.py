@@ -1,10 +1,10 @@
 """Filtered navigation in the closed loop: sensors see the truth, the filter sees the sensors.
 
-Of an emulated receiver's errors the part that UAVs have in common (orbits, clocks, atmosphere) stays as it is
-for minutes. No filter can take it out, and one that believed the whole error to change would soon claim to have
-done so. The filter is therefore given the covariance of the rest, S C S^T - L L^T, and L L^T is added to what it
-reports: a Schmidt-Kalman filter's treatment of a constant, but for gains that ignore it. The same L is the common
-factor of the UAVs.
+Of an emulated receiver's errors the part that UAVs have in common (orbits, clocks, atmosphere) stays as it
+is for minutes. No filter can take it out, and one that believed the whole error to change would soon claim to
+have done so. The filter is therefore given the covariance of the rest, S C S^T - L L^T, and L L^T is added to
+what it reports: a Schmidt-Kalman filter's treatment of a constant, but for gains that ignore it. The same L
+is the common factor of the UAVs.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class FilteredNavigation:
 
 def _square(factor: Array) -> Array:
     """L L^T of factors (..., 3, rank)."""
-    return np.einsum("...ak,...bk->...ab", factor, factor)
+    return np.asarray(np.einsum("...ak,...bk->...ab", factor, factor))
 
 
 def _with_lasting(found: NavSolution, factor: Array) -> NavSolution:

@@ -2,8 +2,8 @@ r"""The emulated GNSS receiver: which signals of which satellites it has at a pl
 
 The error of a pseudorange is, for satellite s and UAV i,
 
-.. math:: \varepsilon_{is} = \underbrace{\sigma_{sis} a_s + \sigma_{ion} F(E_s)\, b_s + \sigma_{tro} m(E_s)\, c_s}_{
-          \text{common to all UAVs}} + \underbrace{\sigma_n(C/N_0)\, z_{is} +
+.. math:: \varepsilon_{is} = \underbrace{\sigma_{sis} a_s + \sigma_{ion} F(E_s)\, b_s
+          + \sigma_{tro} m(E_s)\, c_s}_{\text{common to all UAVs}} + \underbrace{\sigma_n(C/N_0)\, z_{is} +
           \begin{cases} \sigma_{mp}(E_s)\, g_s(x_i, t) & \text{in sight} \\ d_s(x_i, t) & \text{reflected}
           \end{cases}}_{\text{its own}}
 
@@ -11,7 +11,8 @@ with a, b, c standard normal once a mission (they change over hours), z white, g
 (:mod:`napf_mpc.navigation.wave_field`), and d >= 0 an exponential extra path that is such a field, too. A
 satellite that buildings hide arrives by reflection, weaker by a loss that varies from place to place; what is
 weaker than the mask is not received. The receiver knows elevation and C/N0, but not what is reflected. It
-takes its sigmas from the laws above, and for reflections, which come weak, adds a sigma that grows as C/N0 falls.
+takes its sigmas from the laws above, and for reflections, which come weak, adds a sigma that grows as C/N0
+falls.
 
 The receiver's clock adds the same to all ranges of a system and is solved for, so it drops out to rounding
 and is left out here. So do group delays and all that a satellite's own clock does: who is told the true
@@ -218,7 +219,8 @@ def _receive(
                     error[r, i, s] = common[r, s] + multipath[r, s] * g
                 else:
                     # From normal to exponential: -log of a uniform number.
-                    error[r, i, s] = common[r, s] - delay_m * math.log(0.5 * math.erfc(g / math.sqrt(2.0)))
+                    tail = 0.5 * math.erfc(g / math.sqrt(2.0))
+                    error[r, i, s] = common[r, s] - delay_m * math.log(tail)
 
 
 def origin_deg(config: Gnss, world: World) -> tuple[float, float]:
@@ -340,7 +342,7 @@ def _refuse(config: Gnss, count: int, late_s: float) -> None:
         "navigation",
         [
             f"{count} satellites of {source} stand above elevation_mask_deg = {config.elevation_mask_deg:g} "
-            f"{late_s / 3600.0:.2f} h after start_gps_time = {config.start_gps_time}: too few for a position; "
-            "lower the mask, choose another time or a shorter start_spread_h, or receive more systems"
+            f"{late_s / 3600.0:.2f} h after start_gps_time = {config.start_gps_time}: too few for a position;"
+            " lower the mask, choose another time or a shorter start_spread_h, or receive more systems"
         ],
     )

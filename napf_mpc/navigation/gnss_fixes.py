@@ -1,4 +1,4 @@
-"""Position fixes of emulated receivers: ranges at the true place, solved, with the covariance of that solution."""
+"""Position fixes of emulated receivers: ranges at the true place, solved, with that solution's covariance."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def solve_observation(
 
     At distances of hundreds of metres the linear solution is that of full pseudoranges to under a millimetre.
     """
-    runs, uavs, sats = observed.error.shape
+    _, uavs, sats = observed.error.shape
     unit = np.repeat(observed.directions[:, None], uavs, axis=1)
     return solve(
         unit.reshape(-1, sats, 3),

@@ -1,4 +1,4 @@
-"""Where satellites are: broadcast ephemerides against another implementation, files, the nominal constellation."""
+"""Where satellites are: broadcast orbits against another implementation, files, the nominal constellation."""
 
 import datetime as dt
 from pathlib import Path
@@ -109,7 +109,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 
 def test_orbits_are_those_of_another_implementation(data_folder: Path) -> None:
-    """All GPS, Galileo and QZSS satellites of a measured file, every half hour of a day: within a centimetre."""
+    """All GPS, Galileo and QZSS satellites of a measured file, every half hour of a day: within 1 cm."""
     gnss = pytest.importorskip("cssrlib.gnss", reason="cssrlib is not installed")
     from cssrlib.ephemeris import eph2pos
     from cssrlib.rinex import rnxdec

@@ -88,7 +88,7 @@ def test_nothing_stands_in_the_way_of_an_empty_scene_and_unwanted_rays_are_not_f
 def test_each_run_looks_at_its_own_scene() -> None:
     wall = ObstacleSet.from_shapes([Box((20.0, 0.0, 15.0), (10.0, 40.0, 30.0))])
     both = ObstacleSet.stack([wall, ObstacleSet.empty()])
-    seen = line_of_sight(both, np.zeros((2, 1, 3)) + [0.0, 0.0, 2.0], np.array([[EAST]]))
+    seen = line_of_sight(both, np.full((2, 1, 3), [0.0, 0.0, 2.0]), np.array([[EAST]]))
     assert seen.ravel().tolist() == [False, True]
 
 
@@ -104,7 +104,7 @@ def test_it_is_what_the_signed_distance_says_along_the_ray() -> None:
             Sphere((x, y, stream.uniform(0.0, 30.0)), size),
             Cylinder((y, x), 0.4 * size, 0.0, 3.0 * size),
             Box((-x, y, size), (size, 2.0 * size, 2.0 * size), stream.uniform(0.0, 3.0)),
-            Prism((star + [-y, -x],), 0.0, 2.5 * size),
+            Prism((star - np.array([y, x]),), 0.0, 2.5 * size),
         ]
     scene = ObstacleSet.from_shapes(shapes)
     points = np.concatenate([stream.uniform(-60.0, 60.0, (40, 2)), stream.uniform(0.5, 25.0, (40, 1))], -1)
