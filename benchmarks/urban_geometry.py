@@ -3,8 +3,8 @@
     python benchmarks/urban_geometry.py --data DIR [--points N]
 
 Free points are drawn uniformly over 1 km x 1 km about the city hall, moments uniformly over 2023-07-11 (GPS
-time); GPS, Galileo and QZSS above 10 degrees and in line of sight. One clock for GPS and QZSS, one for Galileo.
-Solvable: satellites >= 3 + clocks and PDOP <= 100. The last column takes one clock for all systems.
+time); GPS, Galileo and QZSS above 10 degrees and in line of sight. One clock for GPS and QZSS, one for
+Galileo. Solvable: satellites >= 3 + clocks and PDOP <= 100. The last column takes one clock for all systems.
 """
 
 import argparse

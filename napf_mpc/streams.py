@@ -33,6 +33,7 @@ class Stream(IntEnum):
     GNSS_COMMON = 14
     GNSS_WAVES = 15
     GNSS_NOISE = 16
+    GNSS_PHASES = 17
 
 
 class Numbers(Protocol):

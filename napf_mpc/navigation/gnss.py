@@ -304,7 +304,7 @@ def gnss_scene(
             _refuse(config, int(high.sum()), float(start[r]) - first)
     count = len(names)
     normal = normals(seed, runs, Stream.GNSS_WAVES, count, 1, _FIELDS * WAVES * 4)
-    uniform = uniforms(seed, runs, Stream.GNSS_WAVES, count, 2, _FIELDS * WAVES)[:, :, 1]
+    uniform = uniforms(seed, runs, Stream.GNSS_PHASES, count, 1, _FIELDS * WAVES)
     return GnssScene(
         config=config,
         names=names,

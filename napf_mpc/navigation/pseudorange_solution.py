@@ -7,8 +7,8 @@ A pseudorange less the range that is expected at an approximate place is, to fir
 with u the unit vector to the satellite, x the place sought from the approximate one and c the receiver's
 clock against the satellite's system. With rows h = (-u, 0..1..0), weights W and
 :math:`S = (H^T W H)^{-1} H^T W`, the solution is S y, and its covariance S C S^T with C that of the errors;
-it is :math:`(H^T W H)^{-1}` only if W is the inverse of C. Errors that two receivers share satellite by satellite,
-of covariance C_shared, give the covariance S_i C_shared S_j^T between their positions.
+it is :math:`(H^T W H)^{-1}` only if W is the inverse of C. Errors that two receivers share satellite by
+satellite, of covariance C_shared, give the covariance S_i C_shared S_j^T between their positions.
 
 Residual-based fault detection (Parkinson and Axelrad 1988): without faults, the weighted sum of squared
 residuals follows a chi-square law with n - 3 - m degrees of freedom, n satellites and m clocks. One degree is

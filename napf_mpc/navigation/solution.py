@@ -48,7 +48,7 @@ class NavSolution:
     forecast: CovarianceForecast | None = None
     """What the filter knows of its covariance to come; None if the law of the errors is not known."""
     lasting: Array | None = None
-    """(run, uav, 3, 3) part of the position's covariance that no measurement takes out [m^2]; None for none."""
+    """(run, uav, 3, 3) part of the position's covariance that nothing measured reduces [m^2]; or None."""
 
     @property
     def position_covariance(self) -> Array:

@@ -73,7 +73,7 @@ def test_laws_are_those_of_their_sources() -> None:
 def test_a_field_has_unit_variance_and_its_correlation_over_place_and_time() -> None:
     count = 4000
     normal = normals(1, range(count), Stream.GNSS_WAVES, 1, 1, WAVES * 4).reshape(count, WAVES, 4)
-    uniform = uniforms(1, range(count), Stream.GNSS_WAVES, 1, 2, WAVES)[:, :, 1].reshape(count, WAVES)
+    uniform = uniforms(1, range(count), Stream.GNSS_PHASES, 1, 1, WAVES).reshape(count, WAVES)
     field = waves(normal, uniform, 5.0, 60.0)
 
     def at(x: float, t: float) -> np.ndarray:

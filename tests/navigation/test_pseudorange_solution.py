@@ -220,7 +220,7 @@ def test_numbers_that_are_none_are_refused_only_where_they_count(value: float, s
 
 
 def test_from_full_pseudoranges_the_place_comes_back_and_the_linear_solution_is_right() -> None:
-    """Truth to pseudoranges to place; with errors of tens of metres, S e is that place to some millimetres."""
+    """Truth to pseudoranges to place; with errors of tens of metres, S e is that place to millimetres."""
     constellation = nominal_constellation()
     place = np.array(pymap3d.geodetic2ecef(35.69, 139.69, 80.0))
     axes = east_north_up(35.69, 139.69)
