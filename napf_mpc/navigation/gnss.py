@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import datetime as dt
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -139,15 +139,8 @@ class GnssScene:
             in_sight = np.broadcast_to(above[:, None], noise.shape).copy()
         else:
             in_sight = line_of_sight(self.obstacles, position, unit, above)
-        parts = np.stack(
-            [
-                self.signal_in_space_m,
-                cfg.ionosphere_m * obliquity(elevation),
-                cfg.troposphere_m * troposphere_mapping(elevation),
-            ],
-            axis=-1,
-        )
-        shared = np.sqrt(parts[..., 0] ** 2 + parts[..., 1] ** 2 + parts[..., 2] ** 2)
+        parts = self._shared_parts(elevation)
+        shared = _length(parts)
         drawn = parts * self.common
         low, high = cfg.carrier_to_noise_dbhz
         strength = np.zeros(noise.shape)
@@ -165,14 +158,58 @@ class GnssScene:
         white = code_noise_sigma_m(strength, cfg.code_noise_m)
         # The kernel leaves the white noise to here, where its sigma is known.
         error += np.where(tracked, white * noise, 0.0)
-        believed = (
-            shared[:, None] ** 2
-            + white**2
-            + (cfg.multipath_scale * multipath_sigma_m(elevation))[:, None] ** 2
-            + code_noise_sigma_m(strength, cfg.believed_reflection_m) ** 2
-        )
-        sigma = np.where(tracked, np.sqrt(believed), 0.0)
+        sigma = np.where(tracked, self.believed_sigma(unit, strength), 0.0)
         return Observation(unit, in_sight, tracked, strength, error, sigma, shared)
+
+    def believed_sigma(self, unit: Array, carrier_to_noise: Array) -> Array:
+        """Sigma of ranges as the receiver believes, from what it knows (run, uav, sat) [m].
+
+        Parameters
+        ----------
+        unit : array, shape (run, sat, 3)
+            Directions of satellites.
+        carrier_to_noise : array, shape (run, uav, sat)
+            [dB Hz].
+        """
+        cfg = self.config
+        elevation = np.maximum(elevation_rad(unit), math.radians(cfg.elevation_mask_deg))
+        shared = _length(self._shared_parts(elevation))
+        multipath = cfg.multipath_scale * multipath_sigma_m(elevation)
+        variance = (
+            (shared**2 + multipath**2)[:, None]
+            + code_noise_sigma_m(carrier_to_noise, cfg.code_noise_m) ** 2
+            + code_noise_sigma_m(carrier_to_noise, cfg.believed_reflection_m) ** 2
+        )
+        return np.asarray(np.sqrt(variance))
+
+    def _shared_parts(self, elevation: Array) -> Array:
+        """Sigmas (run, sat, 3) of what all UAVs have in common: signal in space, ionosphere, troposphere."""
+        cfg = self.config
+        return np.stack(
+            [
+                self.signal_in_space_m,
+                cfg.ionosphere_m * obliquity(elevation),
+                cfg.troposphere_m * troposphere_mapping(elevation),
+            ],
+            axis=-1,
+        )
+
+    def of_run(self, run: int, obstacles: ObstacleSet) -> GnssScene:
+        """Return one run of the block, with its own scene."""
+        rows = slice(run, run + 1)
+        return replace(
+            self,
+            nodes=self.nodes[rows],
+            signal_in_space_m=self.signal_in_space_m[rows],
+            common=self.common[rows],
+            fields=Waves(*(part[rows] for part in self.fields)),
+            obstacles=obstacles,
+            start_s=self.start_s[rows],
+        )
+
+
+def _length(parts: Array) -> Array:
+    return np.asarray(np.sqrt(parts[..., 0] ** 2 + parts[..., 1] ** 2 + parts[..., 2] ** 2))
 
 
 @compiled
