@@ -1,4 +1,4 @@
-"""Maps of satellite geometry: the open sky is the best, walls take satellites, inside a house there is nothing."""
+"""Maps of satellite geometry: the open sky is best, walls take satellites, inside a house is nothing."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Figures of emulated receivers: every satellite above the mask is on the sky, buildings and lanes are on the map."""
+"""Figures of emulated receivers: every satellite is on the sky, buildings and lanes are on the map."""
 
 from pathlib import Path
 
