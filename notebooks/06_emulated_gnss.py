@@ -14,18 +14,19 @@
 # %% [markdown]
 # # Emulated GNSS receivers
 #
-# A UAV between houses does not have the satellites that the sky holds: walls hide some, and some that they hide
-# still arrive, late, by reflection. Here each UAV has a receiver of its own in a synthetic street; all of it needs
-# no data (`street_canyon_gnss`: nominal GPS and Galileo, each run at a random time of the day).
+# A UAV between houses does not have the satellites that the sky holds: walls hide some, and some that they
+# hide still arrive, late, by reflection. Here each UAV has a receiver of its own in a synthetic street
+# (`street_canyon_gnss`: no data, nominal GPS and Galileo, each run at a random time of the day).
 #
-# The number of missions follows from the variable `NAPF_MPC_NOTEBOOK_RUNS` (300 unless set): receivers are flown
-# along the lanes in a fifth of it, planners in a fiftieth.
+# The number of missions follows from the variable `NAPF_MPC_NOTEBOOK_RUNS` (300 unless set): receivers are
+# flown along the lanes in a fifth of it, planners in a fiftieth.
 
 # %%
 import os
 
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.special import ndtr
 
 from napf_mpc import compare, load_problem
 from napf_mpc.closed_loop import build_scenario
@@ -67,8 +68,8 @@ figure
 # %% [markdown]
 # ## 3. How wrong are positions, and does the receiver know?
 #
-# UAVs are moved along their lanes at the reference speed, one fix a second, without filter or planner. What is
-# reported is $S C S^T$: it knows of elevations, C/N0 and weights, not of which signals were reflected.
+# UAVs are moved along their lanes at the reference speed, one fix a second, without filter or planner. What
+# is reported is $S C S^T$: it knows of elevations, C/N0 and weights, not of which signals were reflected.
 
 # %%
 fixes = scenario.errors.begin()
@@ -91,9 +92,11 @@ with house_style():
         ratio = np.sort((np.abs(error[..., a]) / sigma[..., a]).ravel())
         right.semilogy(ratio, 1.0 - np.arange(len(ratio)) / len(ratio), color=colour)
     k = np.linspace(0.0, 6.0, 100)
-    right.semilogy(k, 2.0 * np.exp(-(k**2) / 2.0) / np.sqrt(2.0 * np.pi) / np.maximum(k, 0.8), color=GREY)
+    right.semilogy(k, 2.0 * ndtr(-k), color=GREY, label="normal law")
     left.set(xlabel="along the street (m)", ylabel="m")
-    left.legend(title="68 % of errors; dashed: sigma")
+    left.set_title("68 % of errors, and reported sigma (dashed)")
+    left.legend()
+    right.legend()
     right.set(xlabel="error over reported sigma", ylabel="share beyond", xlim=(0.0, 6.0), ylim=(1e-3, 1.0))
 plt.show()
 
@@ -103,15 +106,15 @@ for bound in (1, 2, 3):
 print(f"N = {runs} runs of {error.shape[0]} epochs (correlated) and {error.shape[2]} UAVs")
 
 # %% [markdown]
-# The bulk is overstated and the tail understated, as on a real drive: on the Nagoya log of `docs/navigation.md`
-# 96.4, 97.5 and 93.3 % of errors lie within 3 sigma. (Grey: the tail of a normal law, roughly.) A reported sigma
+# The bulk is overstated and the tail understated, as on a real drive: on the Nagoya log of
+# `docs/navigation.md` 96.4, 97.5 and 93.3 % of errors lie within 3 sigma. A reported sigma
 # is no bound.
 
 # %% [markdown]
 # ## 4. What do UAVs have in common?
 #
-# Errors of orbits, clocks and atmosphere are the same for all UAVs, satellite by satellite; reflections are not.
-# How much of the variance is shared follows from which satellites each of them has.
+# Errors of orbits, clocks and atmosphere are the same for all UAVs, satellite by satellite; reflections are
+# not. How much of the variance is shared follows from which satellites each of them has.
 
 # %%
 share = np.median(np.array(between) / (sigma[:, :, 0] * sigma[:, :, 1]), axis=(0, 1))
@@ -119,21 +122,20 @@ apart = error[:, :, 0] - error[:, :, 1]
 alone = np.sqrt(np.median(error[:, :, 0] ** 2 + error[:, :, 1] ** 2, axis=(0, 1)))
 print("share of the reported variance (UAV 1 and 2): " + ", ".join(f"{x:.2f}" for x in share))
 print(
-    "median size of the difference of their errors, over that of unrelated ones: "
+    "median difference of their errors, over that of unrelated ones: "
     + ", ".join(f"{x:.2f}" for x in np.sqrt(np.median(apart**2, axis=(0, 1))) / alone)
 )
 
 # %% [markdown]
 # ## 5. Who gets through the street?
 #
-# All planners fly the same skies, streets and errors; intervals are 95 % Wilson. (With few missions they say little.)
+# All planners fly the same skies, streets and errors; intervals are 95 % Wilson, and wide for few missions.
 
 # %%
 flown = max(2, RUNS // 50)
 summary = compare(load_problem("street_canyon_gnss"), ["apf", "napf", "qp"], runs=flown, seed=1)
 for name, planner in summary["planners"].items():
     low, high = planner["collision_risk_low"], planner["collision_risk_high"]
-    print(
-        f"{name}: collision risk {planner['collision_risk']:.1%} [{low:.1%}, {high:.1%}], N = {planner['runs']}; "
-        f"NEES of positions {planner['nees_position']['median']:.2f}"
-    )
+    nees = planner["nees_position"]["median"]
+    risk = f"collision risk {planner['collision_risk']:.1%} [{low:.1%}, {high:.1%}]"
+    print(f"{name}: {risk}, N = {planner['runs']}; NEES of positions {nees:.2f}")
