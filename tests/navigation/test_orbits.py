@@ -108,15 +108,30 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_rinex_navigation(tmp_path / "gone.nav")
 
 
-def test_orbits_are_those_of_another_implementation(data_folder: Path) -> None:
+def carried_on(mean: float, eccentricity: float) -> tuple[float, float]:
+    """Solve Kepler's equation by the other implementation's iteration, to the end.
+
+    It stops after ten steps, which leaves 6 cm on E14 and E18 (eccentricity 0.16).
+    """
+    anomaly = mean
+    for _ in range(100):
+        anomaly = mean + eccentricity * np.sin(anomaly)
+    return anomaly, np.sin(anomaly)
+
+
+def test_orbits_are_those_of_another_implementation(
+    data_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All records of all GPS, Galileo and QZSS satellites of a measured file of 27 h: within 1 cm."""
     gnss = pytest.importorskip("cssrlib.gnss", reason="cssrlib is not installed")
+    from cssrlib import ephemeris
     from cssrlib.ephemeris import eph2pos
     from cssrlib.rinex import rnxdec
 
     path = data_folder / "gnss_nagoya_spp" / "broadcast.nav"
     nav = gnss.Nav()
     rnxdec().decode_nav(str(path), nav)
+    monkeypatch.setattr(ephemeris, "eccentricAnomaly", carried_on)
     theirs = {}
     for one in nav.eph:
         if one.mode == 0:
