@@ -6,8 +6,8 @@
 All records of GPS, Galileo (I/NAV) and QZSS in the file, every ten minutes within two hours of their time.
 
 cssrlib 1.2.1 solves Kepler's equation by ten steps E <- M + e sin E. That is within 0.1 mm for e < 0.1, but
-leaves 6 cm on the two Galileo satellites of eccentricity 0.16 (E14, E18). They are compared twice: as they come
-out, and with the iteration carried on to rounding.
+leaves 6 cm on the two Galileo satellites of eccentricity 0.16 (E14, E18). They are compared twice: as they
+are, and with the iteration carried on to rounding.
 """
 
 import argparse

@@ -1,10 +1,11 @@
 """Satellites in sight and dilution of precision by height among the buildings of Nishi-Shinjuku.
 
-    python benchmarks/urban_geometry.py --data DIR [--points N]
+    python benchmarks/urban_geometry.py --data DIR [--points N] [--moment 2023-07-11T23:10]
 
 Free points are drawn uniformly over 1 km x 1 km about the city hall, moments uniformly over 2023-07-11 (GPS
-time); GPS, Galileo and QZSS above 10 degrees and in line of sight. One clock for GPS and QZSS, one for
-Galileo. Solvable: satellites >= 3 + clocks and PDOP <= 100. The last column takes one clock for all systems.
+time) unless one is given; GPS, Galileo and QZSS above 10 degrees and in line of sight. One clock for GPS and
+QZSS, one for Galileo. Solvable: satellites >= 3 + clocks and PDOP <= 100. The last column takes one clock for
+all systems.
 """
 
 import argparse
@@ -31,7 +32,7 @@ _PLAIN = SolverSettings("plain", exclude=False, max_pdop=100.0)
 
 
 def at_height(
-    city: ObstacleSet, records: Ephemerides, height_m: float, count: int, seed: int
+    city: ObstacleSet, records: Ephemerides, height_m: float, count: int, seed: int, moment_s: float | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Satellites (point,), and HDOP, VDOP, PDOP (point, 3) with two clocks and with one."""
     stream = generator(seed, round(height_m), Stream.SCENE)
@@ -40,7 +41,8 @@ def at_height(
     one: list[NDArray[np.float64]] = []
     while len(seen) < count:
         place = np.array([[[*stream.uniform(-HALF_M, HALF_M, 2), height_m]]])
-        time_s = gps_seconds(dt.datetime(2023, 7, 11)) + 86_400.0 * stream.uniform()
+        drawn_s = gps_seconds(dt.datetime(2023, 7, 11)) + 86_400.0 * stream.uniform()
+        time_s = drawn_s if moment_s is None else moment_s
         if city.signed_distance(place)[0, 0] <= 0.0:
             continue
         constellation = records.at(time_s)
@@ -60,6 +62,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="data folder")
     parser.add_argument("--points", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--moment", type=dt.datetime.fromisoformat, help="GPS time, the same for all points")
     options = parser.parse_args()
     latitude, longitude = ORIGIN_DEG
     world = City(
@@ -70,11 +73,12 @@ def main() -> None:
     )
     city = load_city(world, options.data)
     records = read_rinex_navigation(options.data / "gnss_nagoya_spp" / "broadcast.nav")
+    moment_s = None if options.moment is None else gps_seconds(options.moment)
     print(f"N = {options.points} points a height, seed {options.seed}")
     print("| height m | satellites (min) | solvable | HDOP median / 95 % | VDOP median / 95 % | one clock |")
     print("| --- | --- | --- | --- | --- | --- |")
     for height in (5.0, 20.0, 60.0, 120.0, 240.0):
-        seen, two, one = at_height(city, records, height, options.points, options.seed)
+        seen, two, one = at_height(city, records, height, options.points, options.seed, moment_s)
         solved, alone = np.isfinite(two[:, 0]), np.isfinite(one[:, 0])
         h, v = two[solved, 0], two[solved, 1]
         print(
