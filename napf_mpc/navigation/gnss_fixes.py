@@ -9,7 +9,7 @@ from napf_mpc.navigation.fix import Fix, coasting_variance
 from napf_mpc.navigation.gnss import GnssScene, Observation
 from napf_mpc.navigation.pseudorange_solution import Check, PseudorangeSolution, SolverSettings, solve
 from napf_mpc.problem import Gnss
-from napf_mpc.streams import NormalSequence, Seed, Stream
+from napf_mpc.streams import NormalRows, Seed, Stream
 
 __all__ = ["GnssErrors", "GnssFixes", "solve_observation", "solver_settings"]
 
@@ -68,9 +68,10 @@ class GnssErrors:
 
     def begin(self) -> GnssFixes:
         """Return the fixes of one flight, from epoch 0 on; each flight meets the same errors."""
-        noise = NormalSequence(
-            self._seed, self._runs, Stream.GNSS_NOISE, self._uavs, len(self.scene.names), ahead=64
-        )
+        receivers, sats = len(self._runs) * self._uavs, len(self.scene.names)
+        # Some ten megabytes of noise at most, but for formations of thousands.
+        ahead = max(1, min(32, 2_000_000 // (receivers * sats)))
+        noise = NormalRows(self._seed, self._runs, Stream.GNSS_NOISE, self._uavs, sats, ahead)
         return GnssFixes(self.scene, noise, self.period_s, (len(self._runs), self._uavs))
 
 
@@ -85,7 +86,7 @@ class GnssFixes:
     ----------
     scene : GnssScene
         What receivers meet.
-    noise : NormalSequence
+    noise : NormalRows
         Code noise (run, uav, sat) of each epoch.
     period_s : float
         Time between two epochs [s].
@@ -93,9 +94,7 @@ class GnssFixes:
         Runs and UAVs.
     """
 
-    def __init__(
-        self, scene: GnssScene, noise: NormalSequence, period_s: float, shape: tuple[int, int]
-    ) -> None:
+    def __init__(self, scene: GnssScene, noise: NormalRows, period_s: float, shape: tuple[int, int]) -> None:
         self._scene, self._noise, self._period_s = scene, noise, period_s
         self._settings = solver_settings(scene.config)
         self._next = 0

@@ -9,6 +9,7 @@ import pytest
 from napf_mpc.block import simulate
 from napf_mpc.closed_loop import build_scenario
 from napf_mpc.errors import DataError, ProblemError
+from napf_mpc.navigation.filtered import FilteredNavigation
 from napf_mpc.navigation.fix import COAST_SIGMA_MPS, Fix
 from napf_mpc.navigation.gnss import DEFAULT_ORIGIN_DEG, GnssScene, gnss_scene, origin_deg
 from napf_mpc.navigation.gnss_fixes import GnssErrors, GnssFixes, solve_observation, solver_settings
@@ -24,7 +25,7 @@ from napf_mpc.navigation.wave_field import WAVES, field_value, waves
 from napf_mpc.problem import City, EmptyWorld, Gnss
 from napf_mpc.problem_file import load_problem
 from napf_mpc.provenance import data_files
-from napf_mpc.streams import Stream, normals, uniforms
+from napf_mpc.streams import NormalRows, Stream, normals, uniforms
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box
 
@@ -271,10 +272,12 @@ def test_an_undetermined_fault_widens_the_report() -> None:
     faulty = fixes.check[:, 0] == Check.FAULTY
     assert faulty.any()
     drawn = scene(config(reflected_delay_m=300.0, believed_reflection_m=0.0), range(200), WALLS)
-    noise = normals(3, range(200), Stream.GNSS_NOISE, 1, len(drawn.names), 1)[..., 0]
+    noise = NormalRows(3, range(200), Stream.GNSS_NOISE, 1, len(drawn.names)).take()
     observed = drawn.observe(0.0, place, noise)
     plain = solve_observation(observed, drawn, solver_settings(drawn.config))
-    ratio = fix.covariance[:, 0, 0, 0] / plain.covariance[:, 0, 0]
+    assert (faulty == (plain.check == Check.FAULTY)).all()
+    there = plain.covariance[:, 0, 0] > 0.0
+    ratio = fix.covariance[:, 0, 0, 0] / np.where(there, plain.covariance[:, 0, 0], 1.0)
     np.testing.assert_allclose(ratio[faulty], plain.excess[faulty])
     assert (ratio[faulty] > 5.0).all()
     np.testing.assert_allclose(ratio[plain.check == Check.PASSED], 1.0)
@@ -317,6 +320,47 @@ def test_what_uavs_share_reaches_the_planner_through_the_filter_and_without() ->
         between = np.einsum("rak,rbk->rab", fix.common_factor[:, 0], fix.common_factor[:, 1])
         assert (np.einsum("raa->ra", between) > 0.1).all()
         assert data_files(problem) == []
+
+
+def test_the_loop_asks_at_the_true_places() -> None:
+    """Fixes at the places that were recorded as true are the errors that the estimates had there."""
+    problem = load_problem("street_canyon_gnss", ['navigation.filter="none"', "simulation.time_limit_s=3"])
+    flown = simulate(problem, "apf", seed=6, runs=2, record_every=5)
+    track = {name: values.reshape(2, -1, 4) for name, values in flown.trajectories.items()}
+    assert isinstance(flown.scenario.errors, GnssErrors)
+    fixes = flown.scenario.errors.begin()
+    for epoch in range(track["t_s"].shape[1]):
+        true = np.stack([track[f"{axis}_m"][:, epoch] for axis in "xyz"], axis=-1)
+        told = np.stack([track[f"est_{axis}_m"][:, epoch] for axis in "xyz"], axis=-1)
+        np.testing.assert_allclose(told - true, fixes.fix(epoch, true).error, atol=1e-9)
+
+
+def test_a_filter_takes_out_what_changes_and_says_that_the_rest_stays() -> None:
+    """Standing under an open sky for 20 s: error over reported sigma is 1, far more without L L^T."""
+    cfg = config(rate_hz=10.0, filter="kalman", believed_reflection_m=0.0, code_noise_m=1.0)
+    runs = range(100)
+    errors = GnssErrors(scene(cfg, runs), 3, runs, 2)
+    still = np.zeros((100, 2, 3))
+    navigation = FilteredNavigation(cfg, errors, 3, runs, 0.02, 5, still)
+    place = line(100, 2, 0.0, z=50.0, apart_m=200.0)
+    for tick in range(1000):
+        nav = navigation.solution(tick, 0.02 * tick, place, still, still, still, np.ones(100, dtype=bool))
+    off = nav.position - place
+    reported = np.einsum("ruaa->rua", nav.position_covariance)
+    assert nav.lasting is not None
+    lasting = np.einsum("ruaa->rua", nav.lasting)
+    assert np.mean(off**2 / reported) == pytest.approx(1.0, abs=0.25)
+    assert np.mean(off**2 / (reported - lasting)) > 2.0
+    between = np.einsum("rak,rbk->rab", nav.common_factor[:, 0], nav.common_factor[:, 1])
+    shared = np.mean(off[:, 0] * off[:, 1], axis=0)
+    np.testing.assert_allclose(shared, np.einsum("raa->a", between) / 100.0, rtol=0.5)
+    # Over a horizon, with fixes and without: the filter's part changes, the rest stays.
+    ahead = np.array([0.0, 5.0])
+    for with_fixes in (True, False):
+        then = np.einsum("ruaxx->ruax", nav.position_covariance_ahead(ahead, with_fixes))
+        np.testing.assert_allclose(then[:, :, 0], reported)
+        assert (then[:, :, 1] > lasting).all()
+    assert (then[:, :, 1] > reported).all()
 
 
 def test_among_real_towers_with_real_ephemerides(data_folder: Path) -> None:
