@@ -609,9 +609,13 @@ class Recorded(_NavigationBase):
     kind: Literal["recorded"]
     """Kind of navigation error."""
     file: str = Field(min_length=1, max_length=1000)
-    """Path under the data folder: RTKLIB ``.pos``, or ``.csv`` with errors and covariances."""
+    """Path under the data folder: RTKLIB ``.pos``, NMEA ``.nmea``, u-blox ``.ubx``, PX4 ``.ulg``, or ``.csv`` with errors and covariances."""  # noqa: E501
+    format: Literal["auto", "pos", "nmea", "ubx", "ulog", "smartloc"] = "auto"
+    """Format of the file; ``auto`` goes by its suffix."""
     truth_file: str | None = Field(None, max_length=1000)
-    """Path of the truth (``.pos``) that a ``.pos`` solution is compared with; a ``.csv`` needs none."""
+    """Path of the truth that positions are compared with, in the same time system; a ``.csv`` needs none."""
+    truth_format: Literal["auto", "pos", "nmea", "ubx", "ulog", "smartloc"] = "auto"
+    """Format of the truth's file."""
     gaps: Literal["close", "outage"] = "close"
     """Epochs without a fix: left out, or replayed as outages."""
     vertical: Literal["barometer", "recorded"] = "barometer"

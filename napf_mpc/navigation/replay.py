@@ -13,11 +13,11 @@ from napf_mpc.data_folder import find_data_file
 from napf_mpc.errors import DataError
 from napf_mpc.navigation.fix import Fix, coasting_variance
 from napf_mpc.navigation.processes import gauss_markov, last_fix
+from napf_mpc.navigation.readers.formats import format_of, read_track
 from napf_mpc.navigation.recorded import (
     ErrorLog,
     errors_against_truth,
     read_error_log_csv,
-    read_rtklib_pos,
     sample_period,
 )
 from napf_mpc.problem import Recorded
@@ -39,17 +39,19 @@ def load_error_log(config: Recorded, data_folder: Path | None) -> ErrorLog:
     DataError
         The log is missing or unusable.
     """
-    suffix = Path(config.file).suffix.lower()
-    if suffix == ".csv":
+    if Path(config.file).suffix.lower() == ".csv" and config.format == "auto":
         if config.truth_file is not None:
             raise DataError(f"navigation.truth_file: {config.file} holds errors already; leave the truth out")
         return read_error_log_csv(find_data_file(config.file, data_folder))
-    if suffix != ".pos":
-        raise DataError(f"navigation.file = {config.file}: must be an RTKLIB .pos or a .csv file")
+    kind = format_of(config.file, config.format, "navigation.file")
     if config.truth_file is None:
-        raise DataError(f"navigation.truth_file: {config.file} holds positions; name the true ones (.pos)")
-    solution = read_rtklib_pos(find_data_file(config.file, data_folder))
-    return errors_against_truth(solution, read_rtklib_pos(find_data_file(config.truth_file, data_folder)))
+        raise DataError(
+            f"navigation.truth_file: {config.file} holds positions; name the true ones, by the same clock"
+        )
+    truth_kind = format_of(config.truth_file, config.truth_format, "navigation.truth_file")
+    solution = read_track(find_data_file(config.file, data_folder), kind)
+    truth = read_track(find_data_file(config.truth_file, data_folder), truth_kind)
+    return errors_against_truth(solution, truth)
 
 
 def recorded_errors(
