@@ -12,8 +12,8 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
+from napf_mpc.navigation.integrity.tails import confidence_factor as confidence_factor
 from napf_mpc.problem import Planner, Problem
 from napf_mpc.risk_budget import RiskBudget
 
@@ -22,24 +22,6 @@ SigmaReading = Literal["directional", "largest", "rms", "chi2"]
 
 DEFAULT_K = 3.0
 """The paper's k: 99.73 % of a normal error, two-sided, in one axis (the paper prints 99.74 %)."""
-
-
-def confidence_factor(confidence: float, dimensions: int = 1) -> float:
-    """Return k for which an error stays within k sigma with the given probability.
-
-    In one dimension k = sqrt(2) erfinv(p), two-sided normal (p = 0.9974 gives 3.01); in more, the square
-    root of the chi-square quantile, so that the whole error vector lies in the k-sigma ellipsoid.
-
-    Raises
-    ------
-    ValueError
-        If confidence is outside (0, 1) or dimensions is not a positive whole number.
-    """
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence = {confidence!r} must be > 0 and < 1")
-    if dimensions < 1 or dimensions != int(dimensions):
-        raise ValueError(f"dimensions = {dimensions!r} must be a whole number >= 1")
-    return math.sqrt(2.0 * float(special.gammaincinv(dimensions / 2.0, confidence)))
 
 
 def directional_sigma(covariance: Array, normal: Array) -> Array:
