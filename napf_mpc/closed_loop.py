@@ -21,6 +21,7 @@ from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.jit import compiled
 from napf_mpc.navigation.error_models import Fix, PositionErrors, position_errors
 from napf_mpc.navigation.filtered import FilteredNavigation
+from napf_mpc.navigation.monitor import InnovationMonitor
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import MovingTracker
 from napf_mpc.planners.planner import Command, Planner
@@ -151,6 +152,8 @@ class Flight:
     the run's UAVs; None if it never did."""
     waited_s: Array | None = None
     """(run,) time in which some UAV was hovering on purpose [s]; None if none ever was."""
+    monitor: InnovationMonitor | None = None
+    """What watched the navigation filter's innovations; None if nothing did."""
 
 
 def closed_loop(
@@ -256,6 +259,7 @@ def closed_loop(
         None if filtered is None else filtered.gated_fixes,
         reason,
         waited_s,
+        None if filtered is None else filtered.monitor,
     )
 
 
@@ -322,6 +326,8 @@ def _solution(time_s: float, state: Array, fix: Fix, covariance: Array) -> NavSo
         body_rates=state[..., RATES].copy(),
         covariance=covariance,
         common_factor=fix.common_factor,
+        overbound=fix.overbound,
+        protection=fix.protection,
     )
 
 

@@ -551,6 +551,8 @@ class _NavigationBase(_Section):
     """Filter: white noise of an accelerometer, as sigma of the velocity after one second [m/s/√s]."""
     innovation_gate_sigma: float = Field(5.0, ge=0.0, le=100.0)
     """Filter: a fix farther than this many sigmas from what is expected is refused; 0 for no gate."""
+    monitor: Literal["none", "innovations"] = "none"
+    """Filter: whether its normalised innovations are watched and reported sigmas that are too small scaled (docs/integrity.md)."""  # noqa: E501
     filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
     """Filter: correlation time that it assumes of the fix's error; by default the error's own."""
     filter_coast_sigma_m: float = Field(10.0, ge=1e-3, le=1e4)
@@ -616,6 +618,8 @@ class Recorded(_NavigationBase):
     """Path of the truth that positions are compared with, in the same time system; a ``.csv`` needs none."""
     truth_format: Literal["auto", "pos", "nmea", "ubx", "ulog", "smartloc"] = "auto"
     """Format of the truth's file."""
+    part: Literal["all", "first_half", "second_half"] = "all"
+    """Part of the log that is replayed; an overbound is fitted to the other half."""
     gaps: Literal["close", "outage"] = "close"
     """Epochs without a fix: left out, or replayed as outages."""
     vertical: Literal["barometer", "recorded"] = "barometer"
@@ -708,6 +712,9 @@ class Planner(_Section):
     sigma: Literal["directional", "largest", "rms", "chi2"] = "directional"
     """Which sigma: along the gradient, the largest axis, the root mean square; chi2 = directional with k from the 3-D chi-square law."""  # noqa: E501
 
+    safety: Literal["k_sigma", "overbound", "protection_level"] = "k_sigma"
+    """What drives the safety distance: k reported sigmas; k sigmas of the reported law's overbound; or the protection level, whatever k is (docs/integrity.md)."""  # noqa: E501
+
     @model_validator(mode="after")
     def _one_confidence(self) -> Planner:
         if self.k is not None and self.confidence is not None:
@@ -715,6 +722,10 @@ class Planner(_Section):
         if self.risk_per_mission is not None and not (self.k is None and self.confidence is None):
             rival = "confidence" if self.k is None else "k"
             raise ValueError(f"exactly one of {rival} and risk_per_mission may be given, not both")
+        if self.risk_per_mission is not None and self.safety == "protection_level":
+            raise ValueError(
+                'safety = "protection_level" has its own risk: leave risk_per_mission out, or use k_sigma'
+            )
         if self.sigma == "chi2" and self.confidence is None:
             raise ValueError('sigma = "chi2" needs confidence (k follows from it)')
         if self.confidence is not None and self.confidence > 1.0 - 1e-12:
@@ -799,7 +810,9 @@ class Problem(_Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> Problem:
-        faults = [*self._initial_faults(), *self._rate_faults(), *self._size_faults()]
+        faults = [
+            *self._initial_faults(), *self._rate_faults(), *self._size_faults(), *self._safety_faults()
+        ]  # fmt: skip
         if isinstance(self.mission, GoalMission) and self.uav_count != 1:
             faults.append(f"formation has {self.uav_count} UAVs, a mission of kind goal needs exactly 1")
         if isinstance(self.mission, GoalMission) and self.planner.kind != "apf":
@@ -821,6 +834,32 @@ class Problem(_Section):
             if rows is not None and len(rows) != self.uav_count:
                 faults.append(f"mission.{key} has {len(rows)} rows, the formation has {self.uav_count} UAVs")
         return faults
+
+    def _safety_faults(self) -> list[str]:
+        """What is to drive the safety distance must be told by navigation."""
+        navigation = self.navigation
+        if navigation.monitor != "none" and navigation.filter == "none":
+            return [
+                f'navigation.monitor = "{navigation.monitor}" watches a filter\'s innovations: set '
+                'navigation.filter = "kalman"'
+            ]
+        if self.planner.safety == "overbound":
+            if not isinstance(navigation, Recorded):
+                return [
+                    f'planner.safety = "overbound": navigation.kind = "{navigation.kind}" has no log to fit '
+                    'one to; use kind = "recorded", or safety = "k_sigma"'
+                ]
+            if navigation.part == "all":
+                return [
+                    'planner.safety = "overbound" is fitted to the half of the log that is not flown: set '
+                    'navigation.part = "first_half" or "second_half"'
+                ]
+        if self.planner.safety == "protection_level" and navigation.filter != "none":
+            return [
+                'planner.safety = "protection_level" bounds the error of fixes, not of a filter\'s estimate: '
+                'set navigation.filter = "none", or safety = "k_sigma"'
+            ]
+        return []
 
     def _size_faults(self) -> list[str]:
         """Each of these may be large, but not all of them at once."""

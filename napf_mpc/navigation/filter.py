@@ -23,7 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation import cross_covariance, kalman
+from napf_mpc.navigation.fix import is_symmetric
 from napf_mpc.navigation.forecast import CovarianceForecast, ForecastModel, drifts
+from napf_mpc.navigation.monitor import InnovationMonitor, MonitorEvent, squared_innovations
 from napf_mpc.navigation.sensors import bias_memory
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Recorded
@@ -75,6 +77,8 @@ class FilterModel:
     """Largest innovation in its sigmas; 0 for none."""
     coast_sigma_m: float
     """Largest sigma of an axis with which a solution without a fix counts as available [m]."""
+    monitored: bool = False
+    """Whether innovations are watched, and sigmas that are too small scaled."""
 
     @classmethod
     def of_navigation(cls, navigation: Navigation, period_s: float, ticks_per_epoch: int) -> FilterModel:
@@ -110,6 +114,7 @@ class FilterModel:
             velocity_change_noise=navigation.accelerometer_noise_mps_rts**2 * period_s,
             gate=navigation.innovation_gate_sigma,
             coast_sigma_m=navigation.filter_coast_sigma_m,
+            monitored=navigation.monitor == "innovations",
         )
 
     def forecast(self) -> ForecastModel:
@@ -159,6 +164,8 @@ class KalmanFilter:
         self._forecast = model.forecast()
         self._sigma = np.full((runs, uavs, 3), np.nan)
         self._epochs_since_new, self._epochs_per_new = 0, 1
+        self._monitor = InnovationMonitor(runs, uavs) if model.monitored else None
+        self._epoch = 0
 
         shared = bool(model.common_share.any()) and 1 < uavs <= cross_covariance.MAX_UAVS
         kept = runs if shared or model.coupled else 0
@@ -177,6 +184,16 @@ class KalmanFilter:
     def refused_fixes(self) -> NDArray[np.int64]:
         """(run, uav) number of fixes refused so far, by the gate or as unusable."""
         return self._refused_fixes.copy()
+
+    @property
+    def monitor(self) -> InnovationMonitor | None:
+        """What watches the innovations; None if nothing does."""
+        return self._monitor
+
+    @property
+    def events(self) -> list[MonitorEvent]:
+        """Alarms of the monitor so far."""
+        return [] if self._monitor is None else self._monitor.events
 
     def predict(self, velocity_change: Array, active: Mask) -> None:
         """Carry the estimates over a tick.
@@ -211,7 +228,8 @@ class KalmanFilter:
         position, velocity : array, shape (run, uav, 3)
             Measured [m, m/s].
         covariance : array, shape (run, uav, 3, 3)
-            Of the position's error, as reported [m^2].
+            Of the position's error, as reported [m^2]. One that is not symmetric is no covariance, and its
+            fix is refused.
         available : array of bool, shape (run, uav)
             Whether there is a fix.
         new : bool
@@ -223,9 +241,15 @@ class KalmanFilter:
         variance = np.einsum("...ii->...i", covariance)
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(variance)
+        sound = is_symmetric(covariance)
+        if not sound.all():
+            sigma = np.where(sound[..., None], sigma, np.nan)
         begins = ~self._begun | (self._refused_s >= GATE_PATIENCE_S - 1e-9)
         first = not self._begun.any()
         has_fix = (available | first) & (new | first)
+        if self._monitor is not None:
+            sigma, covariance = self._watched(position, sigma, covariance, has_fix, begins, active)
+        self._epoch += 1
         self._carried[...] = self._since[-1]
         kalman.correct(
             self._mean,
@@ -254,6 +278,26 @@ class KalmanFilter:
             self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
         self._note_verdict(available, active)
         self._advance_covariances(covariance, sigma, active)
+
+    def _watched(
+        self, position: Array, sigma: Array, covariance: Array, has_fix: Mask, begins: Mask, active: Mask
+    ) -> tuple[Array, Array]:
+        """Sigmas (run, uav, 3) and covariances (run, uav, 3, 3) as the monitor makes them believable."""
+        monitor, model = self._monitor, self._model
+        assert monitor is not None
+        measured = (has_fix[..., None] | model.fixless_axis) & ~begins[..., None] & active[:, None, None]
+        squared = np.empty(sigma.shape)
+        squared_innovations(
+            self._mean, self._packed, position, sigma * np.sqrt(monitor.scale), measured,
+            model.error_memory, model.error_noise, RECEIVER_NOISE_M**2, squared,
+        )  # fmt: skip
+        change = monitor.observe(squared, self._epoch * model.ticks_per_epoch * model.period_s)
+        if (change != 1.0).any():
+            kalman.rescale(self._mean, self._packed, change)
+        if (monitor.scale == 1.0).all():
+            return sigma, covariance
+        root = np.sqrt(monitor.scale)
+        return sigma * root, covariance * root[..., :, None] * root[..., None, :]
 
     def _note_verdict(self, available: Mask, active: Mask) -> None:
         verdict = self._verdict

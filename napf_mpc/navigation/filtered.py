@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation.filter import FilterModel, KalmanFilter
 from napf_mpc.navigation.fix import PositionErrors
+from napf_mpc.navigation.integrity.overbound import Overbound
+from napf_mpc.navigation.monitor import InnovationMonitor
 from napf_mpc.navigation.replay import RecordedErrors
 from napf_mpc.navigation.sensors import Sensors
 from napf_mpc.navigation.solution import NavSolution
@@ -55,6 +58,7 @@ class FilteredNavigation:
         uavs = velocity.shape[1]
         self._errors = errors
         self._ticks_per_fix = ticks_per_fix
+        self._overbound: Overbound | None = None
         self._sensors = Sensors(navigation, seed, runs, uavs, period_s, velocity)
         self._filter = KalmanFilter(
             FilterModel.of_navigation(navigation, period_s, ticks_per_fix), len(runs), uavs
@@ -64,6 +68,11 @@ class FilteredNavigation:
     def gated_fixes(self) -> NDArray[np.int64]:
         """(run,) number of fixes that were refused so far, of all UAVs."""
         return np.asarray(self._filter.refused_fixes.sum(axis=-1), dtype=np.int64)
+
+    @property
+    def monitor(self) -> InnovationMonitor | None:
+        """What watches the innovations; None if nothing does."""
+        return self._filter.monitor
 
     def solution(
         self,
@@ -92,6 +101,7 @@ class FilteredNavigation:
         if tick % self._ticks_per_fix == 0:
             epoch = tick // self._ticks_per_fix
             fix = self._errors.fix(epoch)
+            self._overbound = fix.overbound
             self._filter.correct(
                 position + fix.error,
                 self._sensors.gnss_velocity(velocity),
@@ -100,7 +110,9 @@ class FilteredNavigation:
                 _is_new(self._errors, epoch),
                 active,
             )
-        return self._filter.solution(time_s, attitude.copy(), body_rates.copy())
+        solution = self._filter.solution(time_s, attitude.copy(), body_rates.copy())
+        # A protection level is one of the fix, and says nothing of an estimate: it ends here.
+        return solution if self._overbound is None else replace(solution, overbound=self._overbound)
 
 
 def _is_new(errors: PositionErrors, epoch: int) -> bool:

@@ -8,7 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["COAST_SIGMA_MPS", "Fix", "PositionErrors", "coasting_variance", "diagonal"]
+from napf_mpc.navigation.integrity.overbound import Overbound
+
+__all__ = ["COAST_SIGMA_MPS", "Fix", "PositionErrors", "coasting_variance", "diagonal", "is_symmetric"]
 
 Array = NDArray[np.float64]
 
@@ -36,9 +38,16 @@ class Fix:
     """(run, uav, 3, rank) L of the part that UAVs share, as reported [m]: Sigma_ij = L_i L_j^T for i != j."""
     available: NDArray[np.bool_]
     """(run, uav): whether there is a fix at this epoch."""
+    overbound: Overbound | None = None
+    """Overbound of the reported law; None if none is known."""
+    protection: Array | None = None
+    """(run, uav, 2) horizontal and vertical protection level [m], not finite where there is none; None if
+    the receiver computes none."""
 
     def __post_init__(self) -> None:
-        for array in (self.error, self.covariance, self.common_factor, self.available):
+        for array in (self.error, self.covariance, self.common_factor, self.available, self.protection):
+            if array is None:
+                continue
             array.flags.writeable = False
 
 
@@ -56,6 +65,18 @@ class PositionErrors(Protocol):
 def coasting_variance(age_s: Array) -> Array:
     """Variance that a time without a fix adds to each axis [m^2], any shape."""
     return (COAST_SIGMA_MPS * age_s) ** 2
+
+
+def is_symmetric(covariance: Array) -> NDArray[np.bool_]:
+    """Whether matrices (..., 3, 3) are symmetric to a millionth of their sigmas; others are no covariances.
+
+    What is not finite or has no positive variances is not judged here.
+    """
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.einsum("...ii->...i", covariance))
+        apart = np.abs(covariance - np.swapaxes(covariance, -1, -2))
+        astray = apart > 1e-6 * sigma[..., :, None] * sigma[..., None, :]
+    return ~np.asarray(astray.any(axis=(-2, -1)))
 
 
 def diagonal(values: Array) -> Array:

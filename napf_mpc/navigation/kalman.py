@@ -198,6 +198,36 @@ def correct(
 
 
 @compiled
+def rescale(mean: Array, packed: Array, change: Array) -> None:
+    r"""Take it that the sigmas of fixes were too small so far, in place.
+
+    The error's state g counts in units of the sigma, so it shrinks by the sigma's growth and
+    :math:`\sigma g` stays what it was. Where the sigma grows, so does the position's uncertainty, which came
+    from fixes that were believed too much: P becomes D P D with D = diag(sqrt(change), 1, 1, 1).
+
+    Parameters
+    ----------
+    mean, packed : array, shape (run, uav, 3, 4) and (run, uav, 3, 10)
+        States and their covariance; overwritten.
+    change : array, shape (run, uav, 3)
+        Factor on the variance of the fixes; 1 changes nothing.
+    """
+    for r in range(mean.shape[0]):
+        for i in range(mean.shape[1]):
+            for a in range(3):
+                if change[r, i, a] == 1.0:
+                    continue
+                root = np.sqrt(change[r, i, a])
+                mean[r, i, a, 2] /= root
+                if root > 1.0:
+                    c = packed[r, i, a]
+                    c[0] *= root * root
+                    c[1] *= root
+                    c[2] *= root
+                    c[3] *= root
+
+
+@compiled
 def _forget(x: Array, c: Array, memory: float, noise: float) -> None:
     """Carry the error g from one epoch of fixes to the next."""
     x[2] *= memory

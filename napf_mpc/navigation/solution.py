@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
 from napf_mpc.navigation.forecast import CovarianceForecast
+from napf_mpc.navigation.integrity.overbound import Overbound
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.vehicle.plant import plain
 
@@ -47,6 +48,11 @@ class NavSolution:
     """Moving obstacles as tracked now; None in a world without any."""
     forecast: CovarianceForecast | None = None
     """What the filter knows of its covariance to come; None if the law of the errors is not known."""
+    overbound: Overbound | None = None
+    """Overbound of the reported law, from measured errors; None if none is known."""
+    protection: Array | None = None
+    """(run, uav, 2) horizontal and vertical protection level [m], not finite where there is none; None if
+    navigation computes none."""
 
     @property
     def position_covariance(self) -> Array:
@@ -92,7 +98,7 @@ class NavSolution:
         """(run, uav): a fix is there, all numbers are finite, and the covariance of the position is one.
 
         A variance of zero, a negative one or NaN means "unknown", never "certain", and so does a matrix with
-        a negative eigenvalue: such a solution is not to be planned with.
+        a negative eigenvalue or one that is not symmetric: such a solution is not to be planned with.
         """
         trusted = np.empty(self.available.shape, dtype=np.bool_)
         _sound(
@@ -117,6 +123,10 @@ def _sound(
             for a in range(6):
                 for b in range(6):
                     fine = fine and np.isfinite(covariance[run, uav, a, b])
+            for a in range(3):
+                for b in range(a):
+                    c = covariance[run, uav]
+                    fine = fine and abs(c[a, b] - c[b, a]) <= 1e-6 * np.sqrt(c[a, a] * c[b, b])
             sound[run, uav] = fine
 
 

@@ -64,6 +64,7 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         """Command of all UAVs from the reported solution, the map and the guide."""
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
+        nav = self.inflation.informed(nav)
         position, covariance, trusted = self._estimates(nav)
         ahead = None
         if settings.covariance == "expected":

@@ -186,6 +186,7 @@ class QpPlanner:
 
     def build(self, nav: NavSolution, time_s: float) -> HorizonQp:
         """Programs of this step, in coordinates whose origin is each UAV's reported position."""
+        nav = self._inflation.informed(nav)
         trusted = nav.trusted()
         state = self._state(nav, trusted)
         carried = self._carried(state, time_s)
@@ -197,6 +198,7 @@ class QpPlanner:
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
         """Solve this step's programs and command what was accepted, or what the ladder says."""
+        nav = self._inflation.informed(nav)
         airborne = np.ones(nav.available.shape, dtype=bool) if nav.airborne is None else nav.airborne
         trusted = nav.trusted() & airborne
         self._tracks = nav.tracks

@@ -86,9 +86,9 @@ def effective_sample_size(time_s: Array, values: Array, period_s: float) -> floa
 
     .. math:: n_{eff} = \frac{n}{1 + 2 \sum_{l \ge 1} (m_l / n)\, r_l}
 
-    with :math:`r_l` the correlation over the :math:`m_l` pairs that lie l periods apart, gaps left out,
-    summed until it first is not positive, or l is five times the sum's own correlation time (A. Sokal, "Monte Carlo
-    methods in statistical mechanics", 1997): beyond, there is noise to add and nothing else.
+    with :math:`r_l` the correlation over the :math:`m_l` pairs that lie l periods apart, gaps left out. The
+    sum ends where a correlation is not positive, or where l is five times the sum's own correlation time
+    (A. Sokal, "Monte Carlo methods in statistical mechanics", 1997): beyond, there is only noise to add.
 
     Parameters
     ----------
