@@ -147,6 +147,8 @@ class Flight:
     """(run,) time flown [s]."""
     gated_fixes: NDArray[np.int64] | None = None
     """(run,) position fixes that the navigation filter refused; None without a filter."""
+    missed_fixes: NDArray[np.int64] | None = None
+    """(run,) epochs at which a position fix was due and none came; None without a filter."""
     reason: NDArray[np.int8] | None = None
     """(run,) why it waited at the end, codes of :class:`~napf_mpc.planners.planner.Reason`, the largest of
     the run's UAVs; None if it never did."""
@@ -257,6 +259,7 @@ def closed_loop(
         finish_time,
         duration,
         None if filtered is None else filtered.gated_fixes,
+        None if filtered is None else filtered.missed_fixes,
         reason,
         waited_s,
         None if filtered is None else filtered.monitor,

@@ -64,6 +64,7 @@ METRICS = (
     "nees",
     "nees_position",
     "gated_fixes",
+    "missed_fixes",
     "monitor_alarms",
     "monitor_scale",
 )
@@ -250,6 +251,9 @@ class MissionScore:
                 "nees": whole / compared,
                 "nees_position": position / compared,
                 "gated_fixes": gated.astype(np.float64),
+                "missed_fixes": unknown.copy()
+                if flight.missed_fixes is None
+                else flight.missed_fixes.astype(np.float64),
                 "monitor_alarms": unknown if watched is None else watched.alarms.sum(-1).astype(np.float64),
                 "monitor_scale": unknown.copy() if watched is None else watched.largest.max(-1),
             }

@@ -160,6 +160,7 @@ class KalmanFilter:
         self._used = np.zeros((runs, uavs), dtype=np.bool_)
         self._refused_s = np.zeros((runs, uavs))
         self._refused_fixes = np.zeros((runs, uavs), dtype=np.int64)
+        self._missed_fixes = np.zeros((runs, uavs), dtype=np.int64)
         self._verdict = np.zeros((runs, uavs), dtype=np.int8)
         self._forecast = model.forecast()
         self._sigma = np.full((runs, uavs, 3), np.nan)
@@ -184,6 +185,11 @@ class KalmanFilter:
     def refused_fixes(self) -> NDArray[np.int64]:
         """(run, uav) number of fixes refused so far, by the gate or as unusable."""
         return self._refused_fixes.copy()
+
+    @property
+    def missed_fixes(self) -> NDArray[np.int64]:
+        """(run, uav) number of epochs so far at which a fix was due and none came."""
+        return self._missed_fixes.copy()
 
     @property
     def monitor(self) -> InnovationMonitor | None:
@@ -250,6 +256,7 @@ class KalmanFilter:
         if self._monitor is not None:
             sigma, covariance = self._watched(position, sigma, covariance, has_fix, begins, active)
         self._epoch += 1
+        self._missed_fixes += new & ~available & active[:, None]
         self._carried[...] = self._since[-1]
         kalman.correct(
             self._mean,

@@ -70,6 +70,11 @@ class FilteredNavigation:
         return np.asarray(self._filter.refused_fixes.sum(axis=-1), dtype=np.int64)
 
     @property
+    def missed_fixes(self) -> NDArray[np.int64]:
+        """(run,) number of epochs so far at which a fix was due and none came, of all UAVs."""
+        return np.asarray(self._filter.missed_fixes.sum(axis=-1), dtype=np.int64)
+
+    @property
     def monitor(self) -> InnovationMonitor | None:
         """What watches the innovations; None if nothing does."""
         return self._filter.monitor

@@ -2,12 +2,12 @@ r"""Monitor of normalised innovations: tells when reported sigmas are too small,
 
 The innovation of a fix over its own sigma is a standard-normal number if the filter's model holds, and
 independent of those before (R. K. Mehra, J. Peschon, "An innovations approach to fault detection and
-diagnosis in dynamic systems", Automatica 7, 1971). On each axis of each UAV the last :data:`WINDOW` are kept. With
-:data:`ALARM_HITS` or more of them beyond two sigmas, where a consistent filter has 30 times 0.0455 = 1.4, the
+diagnosis in dynamic systems", Automatica 7, 1971). On each axis of each UAV the last :data:`WINDOW` are
+kept. With :data:`ALARM_HITS` or more of them beyond two sigmas, where a consistent filter has 1.4, the
 reported sigma is taken as too small: its square grows by the median of the squared innovations over that of
 the chi-square law, 0.455. Counts and medians, not means: one wild fix is the gate's affair. The scale falls
-again where :data:`WINDOW` innovations in a row are too small for it, never below 1. As long as no alarm is
-raised, nothing is changed to the last bit.
+again where the median of :data:`WINDOW` innovations is less than half of what it should be, never below 1.
+As long as no alarm is raised, nothing is changed to the last bit.
 """
 
 from __future__ import annotations
@@ -29,9 +29,11 @@ WINDOW = 30
 HIT = 4.0
 """A squared normalised innovation beyond this is a hit."""
 ALARM_HITS = 10
-"""Hits among the window at which an alarm is raised: chance 4e-7 for independent innovations."""
+"""Hits among the window at which an alarm is raised: chance 5e-7 for independent innovations."""
 MEDIAN = 0.454_936_423_119_572_8
 """Median of the chi-square law with one degree of freedom."""
+SLACK = 2.0
+"""A scale falls to this many times what a window asks for: half of all windows ask for less than is right."""
 MAX_SCALE = 1e6
 """Largest factor on a variance."""
 
@@ -100,7 +102,7 @@ class InnovationMonitor:
             if alarm[at]:
                 after = min(MAX_SCALE, self.scale[at] * max(ratio, HIT))
             else:
-                after = max(1.0, self.scale[at] * min(1.0, ratio))
+                after = max(1.0, self.scale[at] * min(1.0, SLACK * ratio))
             change[at] = after / self.scale[at]
             self.scale[at] = after
             self._window[at] = np.nan
