@@ -24,7 +24,7 @@ SHIPPED = shipped_problems()
 NAMES = {
     "potential_surface", "single_uav", "square_8", "square_40", "street_canyon", "nishi_shinjuku",
     "table1_8", "table1_40", "table1_8c", "table1_40c", "study_8s", "study_40s", "study_8c", "study_40c",
-    "crossing_traffic",
+    "crossing_traffic", "nagoya_replay", "berlin_replay",
 }  # fmt: skip
 SMALL = """
 [formation]

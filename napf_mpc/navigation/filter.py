@@ -292,13 +292,20 @@ class KalmanFilter:
         """Sigmas (run, uav, 3) and covariances (run, uav, 3, 3) as the monitor makes them believable."""
         monitor, model = self._monitor, self._model
         assert monitor is not None
+        time_s = self._epoch * model.ticks_per_epoch * model.period_s
+        anew = has_fix & begins & self._begun & active[:, None]
+        if anew.any():
+            with np.errstate(invalid="ignore", divide="ignore"):
+                apart = (position - self._mean[..., 0]) ** 2 / (sigma**2 * monitor.scale)
+            known = anew[..., None] & (sigma > 0.0) & np.isfinite(apart).all(-1, keepdims=True)
+            monitor.disagree(np.where(known, apart, np.nan), time_s)
         measured = (has_fix[..., None] | model.fixless_axis) & ~begins[..., None] & active[:, None, None]
         squared = np.empty(sigma.shape)
         squared_innovations(
             self._mean, self._packed, position, sigma * np.sqrt(monitor.scale), measured,
             model.error_memory, model.error_noise, RECEIVER_NOISE_M**2, squared,
         )  # fmt: skip
-        change = monitor.observe(squared, self._epoch * model.ticks_per_epoch * model.period_s)
+        change = monitor.observe(squared, time_s)
         if (change != 1.0).any():
             kalman.rescale(self._mean, self._packed, change)
         if (monitor.scale == 1.0).all():

@@ -219,8 +219,8 @@ def rescale(mean: Array, packed: Array, change: Array) -> None:
                     continue
                 root = np.sqrt(change[r, i, a])
                 mean[r, i, a, 2] /= root
+                c = packed[r, i, a]
                 if root > 1.0:
-                    c = packed[r, i, a]
                     c[0] *= root * root
                     c[1] *= root
                     c[2] *= root

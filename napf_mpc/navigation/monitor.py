@@ -7,12 +7,14 @@ kept. With :data:`ALARM_HITS` or more of them beyond two sigmas, where a consist
 reported sigma is taken as too small: its square grows by the median of the squared innovations over that of
 the chi-square law, 0.455. Counts and medians, not means: one wild fix is the gate's affair. The scale falls
 again where the median of :data:`WINDOW` innovations is less than half of what it should be, never below 1.
-As long as no alarm is raised, nothing is changed to the last bit.
+Where the filter begins anew with a fix that it had refused, the sigma is then at least their distance. As
+long as no alarm is raised, nothing is changed to the last bit.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +42,7 @@ MAX_SCALE = 1e6
 
 @dataclass(frozen=True)
 class MonitorEvent:
-    """An alarm: the sigma of an axis is too small, and what it is multiplied by from now on."""
+    """An alarm: the sigma of an axis is too small, and what it is multiplied by for now."""
 
     time_s: float
     """When [s]."""
@@ -104,15 +106,35 @@ class InnovationMonitor:
             else:
                 after = max(1.0, self.scale[at] * min(1.0, SLACK * ratio))
             change[at] = after / self.scale[at]
-            self.scale[at] = after
-            self._window[at] = np.nan
-            self._count[at] = 0
-            if alarm[at]:
-                run, uav, axis = (int(i) for i in at)
-                self.alarms[run, uav] += 1
-                self.largest[run, uav] = max(self.largest[run, uav], after**0.5)
-                self.events.append(MonitorEvent(time_s, run, uav, axis, after**0.5))
+            self._set(at, after, time_s, bool(alarm[at]))
         return change
+
+    def disagree(self, squared: Array, time_s: float) -> None:
+        """Note where a filter begins anew with a fix that it had refused.
+
+        Estimate and fix were both believed, and they are so far apart: which of them was wrong nobody knows,
+        so the sigma of the fix is from now on at least that distance, until innovations let it fall.
+
+        Parameters
+        ----------
+        squared : array, shape (run, uav, 3)
+            Squared distances of fix and estimate over the squared sigmas of the fix, with their scales; NaN
+            where nothing begins anew.
+        time_s : float
+            Time of the epoch [s].
+        """
+        for at in zip(*np.nonzero(squared > 1.0), strict=True):
+            self._set(at, min(MAX_SCALE, float(self.scale[at] * squared[at])), time_s, True)
+
+    def _set(self, at: tuple[Any, ...], scale: float, time_s: float, alarm: bool) -> None:
+        self.scale[at] = scale
+        self._window[at] = np.nan
+        self._count[at] = 0
+        if alarm:
+            run, uav, axis = (int(i) for i in at)
+            self.alarms[run, uav] += 1
+            self.largest[run, uav] = max(self.largest[run, uav], scale**0.5)
+            self.events.append(MonitorEvent(time_s, run, uav, axis, scale**0.5))
 
 
 @compiled
@@ -155,5 +177,6 @@ def squared_innovations(
                 spread = c[0] + 2.0 * sigma * memory * c[2] + position_noise
                 spread += sigma * sigma * (memory * memory * c[7] + error_noise[a])
                 miss = fix_position[r, i, a] - x[0] - sigma * memory * x[2]
-                if spread > 0.0 and np.isfinite(miss):
+                # A sigma of zero means unknown: the fix is refused, and says nothing of sigmas.
+                if sigma > 0.0 and spread > 0.0 and np.isfinite(miss):
                     out[r, i, a] = miss * miss / spread

@@ -10,8 +10,8 @@ import pytest
 from navigation_faults import FAULTS, Flown, flags, fly, median_interval
 
 RUNS = 3
-# Fault -> what must flag it in every run. Two need not be told by anything: a constant lag is an error like any
-# other, and a drift shows only when it has outgrown what sigma allows.
+# Fault -> what must flag it in every run. Two need not be told by anything: a constant lag is an error like
+# any other, and a drift shows only when it has outgrown what sigma allows.
 RULES = {
     "nan": "gate",
     "zero": "gate",
@@ -43,10 +43,12 @@ def test_it_is_flagged_by_its_rule(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", FAULTS)
 def test_it_is_survived(kind: str) -> None:
-    """Every number stays finite, no command or rotor leaves its limits, and nothing is touched."""
+    """Every number stays finite, no command or rotor leaves its limits, and the others never pay for it."""
     after = flown(kind)
     assert not after.watch.outside.any()
-    assert not after.score.obstacle_contact[:, 0].any() or kind == "jump"
+    assert not after.score.obstacle_contact[:, 1:].any()
+    if kind not in ("jump", "stuck"):  # wrong fixes that go on are believed in the end
+        assert not after.score.obstacle_contact.any()
     assert np.isfinite(after.score.metrics["path_rms_m"]).all()
     assert np.isfinite(after.watch.largest_error_m).all()
     if kind != "outage_69":

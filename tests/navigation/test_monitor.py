@@ -70,15 +70,28 @@ def test_rescaling_keeps_the_error_and_a_covariance() -> None:
     root = np.tril(np.arange(1.0, 17.0).reshape(4, 4)) / 10.0
     full = root @ root.T
     packed = np.tile(full[np.triu_indices(4)], (1, 1, 3, 1))
-    rescale(mean, packed, np.array([[[4.0, 1.0, 0.25]]]))
-    sigma = np.array([2.0, 1.0, 0.5])  # of the fixes, in units of the old
+    change = np.array([[[4.0, 0.25, 100.0]]])
+    rescale(mean, packed, change)
+    sigma = np.sqrt(change[0, 0])  # of the fixes, in units of the old
     np.testing.assert_allclose(sigma * mean[0, 0, :, 2], 0.8)
-    for axis, grown in enumerate((4.0, 1.0, 1.0)):
+    for axis, grown in enumerate((4.0, 1.0, 100.0)):
         out = np.zeros((4, 4))
         out[np.triu_indices(4)] = packed[0, 0, axis]
         out = np.triu(out) + np.triu(out, 1).T
         assert out[0, 0] == pytest.approx(grown * full[0, 0])
         assert np.linalg.eigvalsh(out).min() > 0.0
+
+
+def test_a_fix_that_was_refused_and_is_begun_with_is_as_uncertain_as_it_is_far() -> None:
+    monitor = InnovationMonitor(1, 2)
+    squared = np.full((1, 2, 3), np.nan)
+    squared[0, 1] = [25.0, 0.5, 4.0]  # 5, 0.7 and 2 sigmas from the estimate
+    monitor.disagree(squared, 7.0)
+    assert np.sqrt(monitor.scale[0]).tolist() == [[1.0, 1.0, 1.0], [5.0, 1.0, 2.0]]
+    assert [(event.uav, event.axis, event.sigma_scale, event.time_s) for event in monitor.events] == [
+        (1, 0, 5.0, 7.0),
+        (1, 2, 2.0, 7.0),
+    ]
 
 
 # ------------------------------------------------------------------------------------------------ flown
