@@ -137,8 +137,8 @@ for words, beyond in (("k sigma", error > plain), ("VPL", quiet & (error > guard
 with house_style():
     figure = stanford_figure(
         [
-            StanfordPanel("k sigma", error, plain, 20.0),
-            StanfordPanel("Protection level", error[quiet], np.full(quiet.sum(), guarded.vertical_m), 20.0),
+            StanfordPanel("k sigma", error, plain, 25.0),
+            StanfordPanel("Protection level", error[quiet], np.full(quiet.sum(), guarded.vertical_m), 25.0),
         ]
     )
 display(figure)  # noqa: F821

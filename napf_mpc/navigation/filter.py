@@ -142,7 +142,7 @@ class KalmanFilter:
 
     Each begins with the first fix that it is given, at t = 0 also with one that is carried on from before:
     position = fix, with the reported sigma; velocity = GNSS velocity; bias zero, with its sigma. After
-    :data:`GATE_PATIENCE_S` of refused fixes it does so again.
+    :data:`GATE_PATIENCE_S` of fixes that the gate refused it does so again.
 
     Parameters
     ----------
@@ -283,7 +283,8 @@ class KalmanFilter:
         self._epochs_since_new += 1
         if new:
             self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
-        self._note_verdict(available, active)
+        usable = np.isfinite(position) & np.isfinite(velocity) & np.isfinite(sigma) & (sigma > 0.0)
+        self._note_verdict(available, np.asarray(usable.all(-1)), active)
         self._advance_covariances(covariance, sigma, active)
 
     def _watched(
@@ -313,7 +314,7 @@ class KalmanFilter:
         root = np.sqrt(monitor.scale)
         return sigma * root, covariance * root[..., :, None] * root[..., None, :]
 
-    def _note_verdict(self, available: Mask, active: Mask) -> None:
+    def _note_verdict(self, available: Mask, usable: Mask, active: Mask) -> None:
         verdict = self._verdict
         flying = active[:, None]
         begun = (verdict == kalman.BEGUN) & flying
@@ -322,7 +323,8 @@ class KalmanFilter:
         self._begun |= begun
         self._refused_fixes += refused
         self._used = (self._used | used) & ~refused & available
-        waiting = available & ~self._used & flying
+        # A fix that is no measurement says nothing against the estimate: patience is for those that disagree.
+        waiting = available & usable & ~self._used & flying
         epoch_s = self._model.period_s * self._model.ticks_per_epoch
         self._refused_s = np.where(self._used, 0.0, self._refused_s + epoch_s * waiting)
 

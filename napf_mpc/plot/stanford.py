@@ -112,10 +112,10 @@ def _panel(axes: Axes, panel: StanfordPanel, high: float) -> None:
     place: dict[str, Any] = {
         "transform": axes.get_yaxis_transform(),
         "ha": "right",
-        "va": "bottom",
+        "va": "top",
         "fontsize": 7.0,
     }
-    axes.text(0.98, limit * 1.05, f"AL = {limit:g} m", color=RULE, **place)
+    axes.text(0.98, limit / 1.05, f"AL = {limit:g} m", color=RULE, **place)
     of = counts.by_class
     false = of[Integrity.UNAVAILABLE_MISLEADING]
     axes.set_title(

@@ -61,7 +61,7 @@ def tail_figure(panels: Sequence[TailPanel], credit: str = "") -> Figure:
         told = k <= supported
         axes.plot(k[told], allowed[told], color=VERMILION)
         axes.plot(k[~told], allowed[~told], color=VERMILION, linestyle="--")
-        axes.set(yscale="log", xlim=(0.0, LARGEST_K), ylim=(1e-3, 1.2))
+        axes.set(yscale="log", xlim=(0.0, LARGEST_K), ylim=(1e-3, 1.2), xticks=range(0, 10, 2))
         axes.axvline(3.0, color=RULE, linewidth=0.5, linestyle=":")
         axes.set_xlabel("k (reported sigmas)")
         axes.set_ylabel("Share of errors beyond k sigma" if place == 0 else "")

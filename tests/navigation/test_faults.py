@@ -68,3 +68,9 @@ def test_without_a_fault_nothing_is_flagged() -> None:
 def test_the_interval_of_a_median_is_that_of_order_statistics() -> None:
     middle, low, high = median_interval(np.arange(100.0))
     assert (middle, low, high) == (49.5, 39.0, 60.0)  # ranks 40 and 61 of 100
+
+
+@pytest.mark.parametrize("kind", ["nan", "zero", "negative", "asymmetric"])
+def test_a_fix_that_is_no_measurement_costs_what_an_outage_costs(kind: str) -> None:
+    """It is refused and counted, and no reason to throw away what the filter knows."""
+    np.testing.assert_array_equal(flown(kind).watch.largest_error_m, flown("outage_5").watch.largest_error_m)
