@@ -308,7 +308,8 @@ def test_folders_and_missing_files(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(ProblemError, match=r"no such file.*did you mean table1_8"):
         load_problem("tabel1_8")
     with pytest.raises(
-        ProblemError, match=r"no such file.*shipped problems: crossing_traffic, nishi_shinjuku"
+        ProblemError,
+        match=r"no such file.*shipped problems: berlin_replay, crossing_traffic, nagoya_replay, nishi_",
     ):
         load_problem("zzz")
     for odd in ("", "a\0b", "x" * 5000, "\x1b[2J"):
