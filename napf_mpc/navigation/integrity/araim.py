@@ -282,11 +282,10 @@ def _solutions(ranges: RangeErrors, clocks: NDArray[np.int64], used: Mask) -> tu
     # A clock that nobody is left to tell is no unknown.
     idle = ~(normal[:, range(3, 3 + m), range(3, 3 + m)] > 0.0)
     normal[:, range(3, 3 + m), range(3, 3 + m)] += idle
-    enough = used.sum(-1) >= 3 + m - idle.sum(-1)
     scale = np.sqrt(np.maximum(np.einsum("kaa->ka", normal), 1e-300))
     scaled = normal / (scale[:, :, None] * scale[:, None, :])
     low = np.linalg.eigvalsh(scaled)[:, 0]
-    solvable = enough & (low > 1.0 / MAX_CONDITION)
+    solvable = low > 1.0 / MAX_CONDITION  # too few satellites leave the matrix singular
     scaled[~solvable] = np.eye(3 + m)
     inverse = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
     gain = np.einsum("kqa,na,kn->kqn", inverse[:, :3], design, weight)

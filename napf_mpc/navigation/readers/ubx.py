@@ -86,23 +86,9 @@ def _messages(path: Path) -> list[Any]:
                 break
             if getattr(message, "identity", "") in wanted:
                 found.append(message)
-        _refuse_cut_off(path, file)
     if not any(message.identity == "NAV-PVT" for message in found):
         raise DataError(f"{path}: no UBX-NAV-PVT messages in it; is it a u-blox log, and is NAV-PVT on?")
     return found
-
-
-def _refuse_cut_off(path: Path, file: Any) -> None:
-    """Refuse a file whose end is the beginning of a message: the reader ends there without a word."""
-    size = path.stat().st_size
-    file.seek(max(0, size - 65_544))
-    tail = file.read()
-    at = tail.rfind(b"\xb5\x62")
-    if at < 0:
-        return
-    length = int.from_bytes(tail[at + 4 : at + 6], "little") if len(tail) >= at + 6 else None
-    if length is None or at + 8 + length > len(tail):
-        raise DataError(f"{path}: the last message is cut off; cut the log before it")
 
 
 def _time_of_week_ms(message: Any) -> int:
