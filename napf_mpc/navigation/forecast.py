@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation import kalman
 
 __all__ = ["CovarianceForecast", "ForecastModel", "variance_ahead"]
@@ -122,10 +122,22 @@ class CovarianceForecast:
 
         Parameters are those of :meth:`variance`.
         """
-        now = self.packed[..., None, :, 0]
-        factor = self.variance(ahead_s, with_fixes) / np.where(now > 0.0, now, np.inf)
-        # What is not above zero is rounding, and would say "certain"; it says that nothing is known.
-        return np.where(np.isfinite(factor) & (factor > 0.0), factor, 1.0)
+        factor = self.variance(ahead_s, with_fixes)
+        _compare(self.packed, factor)
+        return factor
+
+
+@compiled_bare
+def _compare(packed: Array, factor: Array) -> None:
+    """Divide variances to come (run, uav, N, 3) by those of now, in packed covariances (run, uav, 3, 10)."""
+    for r in range(factor.shape[0]):
+        for i in range(factor.shape[1]):
+            for k in range(factor.shape[2]):
+                for a in range(3):
+                    now = packed[r, i, a, 0]
+                    ratio = factor[r, i, k, a] / (now if now > 0.0 else np.inf)
+                    # What is not above zero is rounding, and would say "certain"; nothing is known then.
+                    factor[r, i, k, a] = ratio if 0.0 < ratio < np.inf else 1.0
 
 
 @compiled
@@ -198,7 +210,7 @@ def variance_ahead(
                     out[r, i, k, a] = c[0]
 
 
-@compiled
+@compiled_bare
 def _drift(c: Array, step: Array) -> None:
     """Carry an axis over a number of ticks."""
     pv_, pb_, vb_, left = step[0], step[1], step[2], step[3]
@@ -218,7 +230,7 @@ def _drift(c: Array, step: Array) -> None:
     c[9] = left * left * bb + step[9]
 
 
-@compiled
+@compiled_bare
 def _forget(c: Array, memory: float, noise: float) -> None:
     """Carry the error g from one epoch of fixes to the next."""
     c[2] *= memory
@@ -227,7 +239,7 @@ def _forget(c: Array, memory: float, noise: float) -> None:
     c[8] *= memory
 
 
-@compiled
+@compiled_bare
 def _measured(c: Array, h_p: float, h_v: float, h_g: float, noise: float) -> None:
     """Covariance after a measurement of ``h_p p + h_v v + h_g g``.
 

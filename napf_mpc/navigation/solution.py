@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation.forecast import CovarianceForecast
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.vehicle.plant import plain
@@ -82,10 +83,11 @@ class NavSolution:
         array, shape (run, uav, N, 3, 3)
             [m^2].
         """
-        out = np.repeat(self.position_covariance[:, :, None], len(ahead_s), axis=2)
-        if self.forecast is not None:
-            scale = np.sqrt(self.forecast.change(ahead_s, with_fixes))
-            out *= scale[..., :, None] * scale[..., None, :]
+        if self.forecast is None:
+            return np.repeat(self.position_covariance[:, :, None], len(ahead_s), axis=2)
+        change = self.forecast.change(ahead_s, with_fixes)
+        out = np.empty((*change.shape, 3))
+        _stretch(plain(self.covariance), change, out)
         return out
 
     def trusted(self) -> NDArray[np.bool_]:
@@ -100,6 +102,19 @@ class NavSolution:
             plain(self.covariance), trusted,
         )  # fmt: skip
         return np.asarray(self.available & trusted)
+
+
+@compiled_bare
+def _stretch(covariance: Array, change: Array, out: Array) -> None:
+    """Write covariances (run, uav, N, 3, 3) whose axes have changed by factors (run, uav, N, 3)."""
+    for run in range(out.shape[0]):
+        for uav in range(out.shape[1]):
+            for n in range(out.shape[2]):
+                for a in range(3):
+                    scale = math.sqrt(change[run, uav, n, a])
+                    for b in range(3):
+                        both = scale * math.sqrt(change[run, uav, n, b])
+                        out[run, uav, n, a, b] = covariance[run, uav, a, b] * both
 
 
 @compiled

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.planners.guide_clearance import (
     ALONG,
     HIGH,
@@ -77,7 +77,7 @@ class Prices(NamedTuple):
     apart: float  # squared lack of separation from another UAV [1/m^2]
 
 
-@compiled
+@compiled_bare
 def bent(square: float, far_m: float) -> float:
     """Square of an offset up to ``far_m``, beyond it the tangent (Huber)."""
     if square <= far_m * far_m:
@@ -85,20 +85,20 @@ def bent(square: float, far_m: float) -> float:
     return far_m * (2.0 * math.sqrt(square) - far_m)
 
 
-@compiled
+@compiled_bare
 def steep(slope: float, limit: float) -> float:
     """Factor on the price of a slope: 1 up to a limit, beyond it the fourth power of the ratio."""
     square = max(1.0, slope / limit) ** 2
     return square * square
 
 
-@compiled
+@compiled_bare
 def steep_limit(left_m: float, prices: Prices) -> float:
     """Slope from which slopes cost more on the way to an offset."""
     return prices.steep_far if abs(left_m) > prices.gentle_m else prices.steep
 
 
-@compiled
+@compiled_bare
 def missing_price(missing: float, prices: Prices) -> float:
     """Price of a shortfall: soft within the spare, steep where the margin itself is breached."""
     if missing <= 0.0:
@@ -132,7 +132,7 @@ class Bench(NamedTuple):
     ahead: Array  # (station,) least price of what follows, per squared offset [1/m^2]
 
 
-@compiled
+@compiled_bare
 def list_here(sight: Sight, i: int, lattice: Lattice) -> None:
     """Note which of the solids that UAV i has found reach which stations."""
     near = sight.near
@@ -153,7 +153,7 @@ def list_here(sight: Sight, i: int, lattice: Lattice) -> None:
             sight.known[i, s, v, 1] = -1
 
 
-@compiled
+@compiled_bare
 def _half_step(low: float, high: float, step_m: float) -> float:
     """How far back and forth a place stands for its piece of the path, next to what reaches so far.
 
@@ -163,7 +163,7 @@ def _half_step(low: float, high: float, step_m: float) -> float:
     return 0.5 * step_m if 0.5 * (high - low) < step_m else 0.0
 
 
-@compiled
+@compiled_bare
 def cover(
     sight: Sight, i: int, lattice: Lattice, below: int, s: int, v0: int, v1: int, low: int, high: int
 ) -> None:
@@ -239,7 +239,7 @@ def cover(
                 missing[i, s, v, c] = max(missing[i, s, v, c], short)
 
 
-@compiled
+@compiled_bare
 def _fill_round(
     missing: Array,
     i: int,
@@ -276,7 +276,7 @@ def _fill_round(
         missing[ui, us, uv, c] = max(missing[ui, us, uv, c], short)
 
 
-@compiled
+@compiled_bare
 def any_short(sight: Sight, i: int, lattice: Lattice, below: int, layers: int) -> bool:
     """Whether anything is short for UAV i anywhere on the lattice."""
     cells = 2 * lattice.half + 1
@@ -303,7 +303,7 @@ def any_short(sight: Sight, i: int, lattice: Lattice, below: int, layers: int) -
     return False
 
 
-@compiled
+@compiled_bare
 def bend_offsets(lattice: Lattice, below: int, layers: int, prices: Prices, bend: Array) -> None:
     """Squared offsets (layer, cell) of all places, bent."""
     for v in range(layers):
@@ -313,7 +313,7 @@ def bend_offsets(lattice: Lattice, below: int, layers: int, prices: Prices, bend
             bend[v, c] = bent(left * left + up * up, prices.far_m)
 
 
-@compiled
+@compiled_bare
 def price_ahead(lattice: Lattice, path: float, slope: float, ahead: Array) -> None:
     """Least price of all that follows a station, per squared offset (bent): back to the lane, nothing else.
 
@@ -327,7 +327,7 @@ def price_ahead(lattice: Lattice, path: float, slope: float, ahead: Array) -> No
         ahead[s] = rise * next_one / (rise + next_one)
 
 
-@compiled
+@compiled_bare
 def _own_price(
     left: float, up: float, bend: float, mean: Array, last: Array, i: int, f: int, shape: float, keep: float,
     prices: Prices,
@@ -340,7 +340,7 @@ def _own_price(
     return float(price + keep * min(square, prices.keep_m * prices.keep_m))
 
 
-@compiled
+@compiled_bare
 def _apart_price(
     sight: Sight, lattice: Lattice, below: int, price: float, query: Query, s: int, v: int, c: int
 ) -> float:
@@ -362,7 +362,7 @@ def _apart_price(
     return total
 
 
-@compiled
+@compiled_bare
 def edge_prices(lattice: Lattice, prices: Prices, weight: float, edge: Array) -> None:
     """Prices (2, 3, 2) of steps of so many cells and layers from one station to the next.
 
@@ -377,12 +377,12 @@ def edge_prices(lattice: Lattice, prices: Prices, weight: float, edge: Array) ->
                 edge[far, dc, dv] = weight * prices.slope * factor * square / lattice.step_m
 
 
-@compiled
+@compiled_bare
 def _is_far(c: int, lattice: Lattice, prices: Prices) -> int:
     return 1 if abs(c - lattice.half) * lattice.cell_m > prices.gentle_m else 0
 
 
-@compiled
+@compiled_bare
 def price_of(
     sight: Sight,
     lattice: Lattice,
@@ -427,7 +427,7 @@ def price_of(
     return total
 
 
-@compiled
+@compiled_bare
 def _spread(
     value: Array,
     lowest: int,
@@ -455,7 +455,7 @@ def _spread(
             value[b + v, h + c] += value[b + v, h + c + 1] + per_cell
 
 
-@compiled
+@compiled_bare
 def _relax(
     value: Array,
     bends: Array,
@@ -509,7 +509,7 @@ def _relax(
         value[to, level, c] = x if x + least * bends[layer, column + k] <= limit else np.inf
 
 
-@compiled
+@compiled_bare
 def _pay(
     sight: Sight,
     lattice: Lattice,
@@ -602,7 +602,7 @@ def _pay(
     return v0, v1, c0, c1
 
 
-@compiled
+@compiled_bare
 def search_within(
     sight: Sight,
     lattice: Lattice,
@@ -673,7 +673,7 @@ def search_within(
     return best
 
 
-@compiled
+@compiled_bare
 def _clear(value: Array, s: int, window: tuple[int, int, int, int]) -> None:
     """Make a window and its surroundings infinite."""
     v0, v1, c0, c1 = window
@@ -685,7 +685,7 @@ def _clear(value: Array, s: int, window: tuple[int, int, int, int]) -> None:
             value[to, row, first + c] = np.inf
 
 
-@compiled
+@compiled_bare
 def _trace(
     value: Array,
     lattice: Lattice,
