@@ -182,6 +182,7 @@ def make_scratch(uavs: int, fine: int, most: int, search: Search) -> Scratch:
             np.empty((layers, cells)),
             np.empty((layers, cells)),
             np.empty(stations),
+            np.empty((2, layers + 2, 2), dtype=np.int64),
         ),
         Band(
             np.empty((fine, 3)),
