@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,10 @@ from napf_mpc import store
 from napf_mpc.closed_loop import Scenario, build_scenario, closed_loop
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
+from napf_mpc.navigation.monitor import MonitorEvent
 from napf_mpc.planners.planner import Planner, tally_of
 from napf_mpc.planners.registry import make_planner
-from napf_mpc.planners.tally import Tally
+from napf_mpc.planners.tally import Event, Tally
 from napf_mpc.problem import Problem
 from napf_mpc.record import TrajectoryRecorder
 from napf_mpc.words import shown_value
@@ -164,7 +165,22 @@ def _fly(problem: Problem, planner: Planner, scenario: Scenario, record_every: i
     recorder = TrajectoryRecorder(planner.name, scenario.runs, record_every) if record_every else None
     flight = closed_loop(problem, planner, scenario, (judge,) if recorder is None else (judge, recorder))
     track = {} if recorder is None else recorder.columns()
-    return Missions(judge.score(flight), scenario, track, tally_of(planner, len(scenario.runs)))
+    tally = tally_of(planner, len(scenario.runs))
+    if flight.monitor is not None and flight.monitor.events:
+        # A copy: the planner keeps its own list.
+        tally = replace(tally, events=[*tally.events, *map(_event, flight.monitor.events)])
+    return Missions(judge.score(flight), scenario, track, tally)
+
+
+def _event(alarm: MonitorEvent) -> Event:
+    axis = ("east", "north", "up")[alarm.axis]
+    return Event(
+        alarm.time_s,
+        alarm.run,
+        alarm.uav,
+        f"reported sigma {axis} too small for its innovations",
+        f"sigma {axis} x {alarm.sigma_scale:.3g}",
+    )
 
 
 def score_rows(planner: str, seed: int, score: Score, tally: Tally | None = None) -> store.Columns:

@@ -19,12 +19,16 @@ from numpy.typing import NDArray
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.jit import compiled
-from napf_mpc.navigation.error_models import Fix, PositionErrors, position_errors
+from napf_mpc.navigation.error_models import position_errors
 from napf_mpc.navigation.filtered import FilteredNavigation
+from napf_mpc.navigation.fix import Fix, FixSource, PlacedErrors, PositionErrors, fixes_of_flight
+from napf_mpc.navigation.gnss import gnss_scene
+from napf_mpc.navigation.gnss_fixes import GnssErrors
+from napf_mpc.navigation.monitor import InnovationMonitor
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import MovingTracker
 from napf_mpc.planners.planner import Command, Planner
-from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.problem import FormationMission, Gnss, Problem
 from napf_mpc.streams import Seed
 from napf_mpc.vehicle.lqr import check_sampled_loop
 from napf_mpc.vehicle.plant import advance, plain
@@ -55,7 +59,7 @@ class Scenario:
     """One scene for all runs, or one a run."""
     initial_state: Array
     """(run, uav, 12), Eq. 1."""
-    errors: PositionErrors
+    errors: PositionErrors | PlacedErrors
     """Navigation errors over the whole mission."""
     moving: MovingObstacles | None = None
     """What moves, in truth; planners see its tracks only."""
@@ -104,16 +108,26 @@ def build_scenario(problem: Problem, seed: Seed, runs: range, data_folder: Path 
     frame = PathFrame.of_mission(mission)
     lanes = formation_offsets(problem.formation)[:, 1]
     start = np.broadcast_to(initial_state(problem), (len(runs), problem.uav_count, 12))
+    obstacles = build_scenes(problem.world, frame, lanes, seed, runs, data_folder)
     return Scenario(
         seed,
         runs,
-        build_scenes(problem.world, frame, lanes, seed, runs, data_folder),
+        obstacles,
         start.copy(),
-        position_errors(
-            problem.navigation, seed, runs, problem.uav_count, problem.simulation.time_limit_s, data_folder
-        ),
+        _errors(problem, seed, runs, obstacles, data_folder),
         moving_obstacles(problem.world, seed, runs, problem.simulation.time_limit_s),
     )
+
+
+def _errors(
+    problem: Problem, seed: Seed, runs: range, obstacles: ObstacleSet, data_folder: Path | None
+) -> PositionErrors | PlacedErrors:
+    """Draw the navigation errors; buildings hide satellites, and nothing else of the scene enters."""
+    navigation, limit_s = problem.navigation, problem.simulation.time_limit_s
+    if isinstance(navigation, Gnss):
+        scene = gnss_scene(navigation, problem.world, obstacles, seed, runs, limit_s, data_folder)
+        return GnssErrors(scene, seed, runs, problem.uav_count)
+    return position_errors(navigation, seed, runs, problem.uav_count, limit_s, data_folder)
 
 
 class Observer(Protocol):
@@ -146,11 +160,15 @@ class Flight:
     """(run,) time flown [s]."""
     gated_fixes: NDArray[np.int64] | None = None
     """(run,) position fixes that the navigation filter refused; None without a filter."""
+    missed_fixes: NDArray[np.int64] | None = None
+    """(run,) epochs at which a position fix was due and none came; None without a filter."""
     reason: NDArray[np.int8] | None = None
     """(run,) why it waited at the end, codes of :class:`~napf_mpc.planners.planner.Reason`, the largest of
     the run's UAVs; None if it never did."""
     waited_s: Array | None = None
     """(run,) time in which some UAV was hovering on purpose [s]; None if none ever was."""
+    monitor: InnovationMonitor | None = None
+    """What watched the navigation filter's innovations; None if nothing did."""
 
 
 def closed_loop(
@@ -192,8 +210,7 @@ def closed_loop(
     planner.reset(scenario.obstacles, runs)
     filtered = _filtered(problem, scenario, clock)
     tracker = _tracker(problem, scenario, clock)
-    fix = scenario.errors.fix(0)
-    covariance = _with_velocity(fix.covariance)
+    unfiltered = _Unfiltered(fixes_of_flight(scenario.errors), clock) if filtered is None else None
     command: Command | None = None
     for tick in range(clock.ticks):
         time_s = tick * clock.period_s
@@ -208,10 +225,8 @@ def closed_loop(
                 active,
             )
         else:
-            if tick % clock.ticks_per_fix == 0:
-                fix = scenario.errors.fix(tick // clock.ticks_per_fix)
-                covariance = _with_velocity(fix.covariance)
-            nav = _solution(time_s, state, fix, covariance)
+            assert unfiltered is not None
+            nav = unfiltered.solution(tick, time_s, state)
         if tracker is not None:
             tracker.tick(tick)
         if command is None or tick % clock.ticks_per_plan == 0:
@@ -254,8 +269,10 @@ def closed_loop(
         finish_time,
         duration,
         None if filtered is None else filtered.gated_fixes,
+        None if filtered is None else filtered.missed_fixes,
         reason,
         waited_s,
+        None if filtered is None else filtered.monitor,
     )
 
 
@@ -304,6 +321,21 @@ def _tracker(problem: Problem, scenario: Scenario, clock: _Clock) -> MovingTrack
     return MovingTracker(problem.world, scenario.moving, scenario.seed, scenario.runs, clock.period_s)
 
 
+class _Unfiltered:
+    """Navigation without a filter: the last fix, held."""
+
+    def __init__(self, fixes: FixSource, clock: _Clock) -> None:
+        self._fixes, self._ticks_per_fix = fixes, clock.ticks_per_fix
+        self._held: tuple[Fix, Array] | None = None
+
+    def solution(self, tick: int, time_s: float, state: Array) -> NavSolution:
+        """Issue the solution of a tick, from the true states (run, uav, 12); ticks come from 0 on."""
+        if self._held is None or tick % self._ticks_per_fix == 0:
+            fix = self._fixes.fix(tick // self._ticks_per_fix, state[..., POSITION])
+            self._held = fix, _with_velocity(fix.covariance)
+        return _solution(time_s, state, *self._held)
+
+
 def _with_velocity(covariance: Array) -> Array:
     """Covariance of position and velocity (run, uav, 6, 6); an unfiltered velocity has no error."""
     out = np.zeros((*covariance.shape[:-2], 6, 6))
@@ -322,6 +354,8 @@ def _solution(time_s: float, state: Array, fix: Fix, covariance: Array) -> NavSo
         body_rates=state[..., RATES].copy(),
         covariance=covariance,
         common_factor=fix.common_factor,
+        overbound=fix.overbound,
+        protection=fix.protection,
     )
 
 

@@ -22,6 +22,13 @@ _PUBLIC_HOMES = {
     "gnss_nagoya_spp": (
         "the GNSS log is in the public repository taroz/MatRTKLIB, folder examples/data/kinematic (MIT)"
     ),
+    "gnss_berlin_smartloc": (
+        "the pseudoranges are in the public repository TUC-ProAut/libRSF, folder datasets/smartLoc "
+        "(Reisdorf, Pfeifer, Bressler, Bauer, Weissig, Lange, TU Chemnitz, CC BY-SA 4.0)"
+    ),
+    "px4_ulog_sample": (
+        "the log is test/sample_log_small.ulg of the public repository PX4/pyulog (BSD-3-Clause)"
+    ),
     "city_delft_cityjson": "the city is tests/data/delft.json of the public repository cityjson/cjio (MIT)",
 }
 _DRIVE = re.compile(r"[A-Za-z]:")

@@ -64,6 +64,9 @@ METRICS = (
     "nees",
     "nees_position",
     "gated_fixes",
+    "missed_fixes",
+    "monitor_alarms",
+    "monitor_scale",
 )
 """Metrics of a run, in the order of every table."""
 
@@ -226,6 +229,8 @@ class MissionScore:
         )
         counted = self._sums[:, _COUNT]
         compared, whole, position = self._consistency_sums.T
+        watched = flight.monitor
+        unknown = np.full(len(counted), np.nan)
         gated = np.full(len(counted), np.nan) if flight.gated_fixes is None else flight.gated_fixes
         with np.errstate(invalid="ignore", divide="ignore"):
             progress = (self._end - self._start).mean(-1)
@@ -246,6 +251,11 @@ class MissionScore:
                 "nees": whole / compared,
                 "nees_position": position / compared,
                 "gated_fixes": gated.astype(np.float64),
+                "missed_fixes": unknown.copy()
+                if flight.missed_fixes is None
+                else flight.missed_fixes.astype(np.float64),
+                "monitor_alarms": unknown if watched is None else watched.alarms.sum(-1).astype(np.float64),
+                "monitor_scale": unknown.copy() if watched is None else watched.largest.max(-1),
             }
         for values in metrics.values():
             values[flight.failed] = np.nan

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.jit import compiled_bare
 from napf_mpc.problem import Circle, Formation, FormationMission, Line, Listed, Square, Vee
 
 Array = NDArray[np.float64]
@@ -61,7 +63,7 @@ class PathFrame:
             mission.start_m, math.radians(mission.heading_deg), math.radians(mission.climb_deg)
         )
 
-    @property
+    @cached_property
     def axes(self) -> Array:
         """(3, 3) rows along, left, up."""
         return np.stack([self.along, self.left, self.up])
@@ -77,17 +79,33 @@ class PathFrame:
 
     def to_path(self, positions: Array) -> Array:
         """Path coordinates (..., 3) of world positions (..., 3) [m]."""
-        d = positions - self.origin
-        # Written out: a matrix product over a batch could differ in the last bit with the batch size.
-        return np.stack([_dot(d, self.along), _dot(d, self.left), _dot(d, self.up)], axis=-1)
+        points, out = _points(positions), np.empty(np.shape(positions))
+        _project(points, self.origin, self.axes, out.reshape(points.shape))
+        return out
 
     def along_track(self, positions: Array) -> Array:
         """Along-track coordinate u_i = n^T (X_i - P) of Eq. 17 as read, (...) [m]."""
-        return _dot(positions - self.origin, self.along)
+        points, out = _points(positions), np.empty(np.shape(positions)[:-1])
+        _project(points, self.origin, self.axes[:1], out.reshape(len(points), 1))
+        return out
 
 
-def _dot(vectors: Array, axis: Array) -> Array:
-    return np.asarray(vectors[..., 0] * axis[0] + vectors[..., 1] * axis[1] + vectors[..., 2] * axis[2])
+def _points(positions: Array) -> Array:
+    """Positions (..., 3) as one block of memory (point, 3), the only kind that is compiled for."""
+    points = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, 3)
+    return points if points.flags.writeable else points.copy()
+
+
+@compiled_bare
+def _project(points: Array, origin: Array, axes: Array, out: Array) -> None:
+    """Write coordinates (point, axis) of points from an origin along some axes.
+
+    Written out: a matrix product over a batch could differ in the last bit with the batch size.
+    """
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0] - origin[0], points[n, 1] - origin[1], points[n, 2] - origin[2]
+        for a in range(axes.shape[0]):
+            out[n, a] = x * axes[a, 0] + y * axes[a, 1] + z * axes[a, 2]
 
 
 def _cos_sin(angle: float) -> tuple[float, float]:

@@ -21,8 +21,6 @@ __all__ = ["describe_faults"]
 
 MAX_LINES = 200
 _OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
-# Names that the format knows but this version does not fly.
-_NOT_BUILT = {("navigation", "kind"): ("gnss",)}
 
 
 @dataclass(frozen=True)
@@ -232,8 +230,6 @@ def _wrong_kind(path: list[str | int], place: _Place, value: Mapping[str, Any]) 
         return f"{key}: missing; must be {_choice(kinds)}"
     given = value[tag]
     line = f"{key} = {shown_value(given)}: "
-    if isinstance(given, str) and given in _NOT_BUILT.get((shown_key_path(path), tag), ()):
-        line += "not built in this version; "
     return f"{line}must be {_choice(kinds)}" + (did_you_mean(given, kinds) if isinstance(given, str) else "")
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from napf_mpc import __version__
 from napf_mpc.data_folder import find_data_file
-from napf_mpc.problem import City, Problem, Recorded
+from napf_mpc.problem import City, Gnss, Problem, Recorded
 
 _SHOWING = {"__main__.py", "benchmark", "cli.py", "figures.py", "interrupts.py", "report.py", "plot"}
 """Modules that only show or time results: editing them leaves results as they are."""
@@ -57,6 +57,8 @@ def data_files(problem: Problem) -> list[str]:
         named.append(problem.world.file)
     if isinstance(problem.navigation, Recorded):
         named += [problem.navigation.file, problem.navigation.truth_file]
+    if isinstance(problem.navigation, Gnss):
+        named.append(problem.navigation.file)
     return [name for name in named if name is not None]
 
 

@@ -33,8 +33,11 @@ METRIC_LABELS = {
     "nees": "filter's NEES (1 is consistent)",
     "nees_position": "  of the position alone",
     "gated_fixes": "fixes refused by the filter",
+    "missed_fixes": "fixes that did not come",
+    "monitor_alarms": "alarms of the monitor of innovations",
+    "monitor_scale": "  largest factor on a reported sigma",
 }
-_OF_FILTER = {"nees", "nees_position", "gated_fixes"}
+_OF_FILTER = {"nees", "nees_position", "gated_fixes", "missed_fixes", "monitor_alarms", "monitor_scale"}
 
 
 @dataclass(frozen=True)

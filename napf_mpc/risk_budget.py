@@ -22,7 +22,7 @@ from scipy import optimize
 
 from napf_mpc.first_passage import first_passage_probability, long_run, mission_k
 from napf_mpc.jit import compiled
-from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Problem, Recorded
+from napf_mpc.problem import ConstantBias, GaussMarkov, Gnss, Navigation, Problem, Recorded
 
 __all__ = ["Allocation", "Certificate", "RiskBudget", "RiskLedger", "error_correlation_time"]
 
@@ -63,7 +63,7 @@ def error_correlation_time(navigation: Navigation) -> float:
             return 1.0 / (1.0 / navigation.correlation_time_s + swing)
         case ConstantBias():
             return math.inf
-        case Recorded():
+        case Recorded() | Gnss():
             return navigation.filter_correlation_time_s
 
 

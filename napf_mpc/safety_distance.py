@@ -7,39 +7,24 @@ inflated by k sigma, so the distance that enters the potential field is ``rho_ef
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
+from napf_mpc.errors import ProblemError
+from napf_mpc.navigation.integrity.tails import confidence_factor as confidence_factor
+from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import Planner, Problem
 from napf_mpc.risk_budget import RiskBudget
 
 Array = NDArray[np.float64]
+Safety = Literal["k_sigma", "overbound", "protection_level"]
 SigmaReading = Literal["directional", "largest", "rms", "chi2"]
 
 DEFAULT_K = 3.0
 """The paper's k: 99.73 % of a normal error, two-sided, in one axis (the paper prints 99.74 %)."""
-
-
-def confidence_factor(confidence: float, dimensions: int = 1) -> float:
-    """Return k for which an error stays within k sigma with the given probability.
-
-    In one dimension k = sqrt(2) erfinv(p), two-sided normal (p = 0.9974 gives 3.01); in more, the square
-    root of the chi-square quantile, so that the whole error vector lies in the k-sigma ellipsoid.
-
-    Raises
-    ------
-    ValueError
-        If confidence is outside (0, 1) or dimensions is not a positive whole number.
-    """
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence = {confidence!r} must be > 0 and < 1")
-    if dimensions < 1 or dimensions != int(dimensions):
-        raise ValueError(f"dimensions = {dimensions!r} must be a whole number >= 1")
-    return math.sqrt(2.0 * float(special.gammaincinv(dimensions / 2.0, confidence)))
 
 
 def directional_sigma(covariance: Array, normal: Array) -> Array:
@@ -129,6 +114,8 @@ class Inflation:
     """Which sigma."""
     budget: RiskBudget | None = None
     """What k is to be good for over a whole mission; None if it speaks of one moment."""
+    safety: Safety = "k_sigma"
+    """What the margin is made of."""
 
     def __post_init__(self) -> None:
         # A factor of NaN would make every comparison with rho_0 False: "no obstacle".
@@ -137,6 +124,7 @@ class Inflation:
         for name, value, choices in (
             ("mode", self.mode, ("shift", "range")),
             ("reading", self.reading, get_args(SigmaReading)),
+            ("safety", self.safety, get_args(Safety)),
         ):
             if value not in choices:
                 raise ValueError(f"{name} = {value!r} must be one of {', '.join(choices)}")
@@ -147,7 +135,7 @@ class Inflation:
         planner = problem.planner
         if planner.risk_per_mission is not None:
             budget = RiskBudget.of_problem(problem)
-            return cls(budget.k, planner.inflation, planner.sigma, budget)
+            return cls(budget.k, planner.inflation, planner.sigma, budget, planner.safety)
         return cls.of_planner(planner)
 
     @classmethod
@@ -165,7 +153,56 @@ class Inflation:
             k = confidence_factor(planner.confidence, 3 if planner.sigma == "chi2" else 1)
         else:
             k = DEFAULT_K if planner.k is None else planner.k
-        return cls(k, planner.inflation, planner.sigma)
+        return cls(k, planner.inflation, planner.sigma, safety=planner.safety)
+
+    def informed(self, nav: NavSolution) -> NavSolution:
+        r"""Solution whose covariance is such that k sigma is the margin that was asked for.
+
+        A planner works with what this returns, so that obstacles, neighbours, guidance and the horizon
+        follow one margin. ``k_sigma``: the solution itself. ``overbound``: D Sigma D, D the overbound's
+        factors of the axes at k, and D L for what UAVs share. ``protection_level``: variances (PL / k)^2, so
+        that k sigma is HPL towards every horizontal direction, VPL up and down, and
+        sqrt((n_h HPL)^2 + (n_v VPL)^2) between, which is up to sqrt(2) less than what a cylinder of that
+        radius and half height would reach; nothing counts as shared. Where there is no protection level,
+        nothing bounds the error, and the solution does not count as available.
+
+        Raises
+        ------
+        ProblemError
+            If navigation does not tell what is asked for.
+        """
+        if self.safety == "k_sigma" or self.k == 0.0:
+            return nav
+        if self.safety == "overbound":
+            if nav.overbound is None:
+                raise ProblemError(
+                    "planner.safety", ['= "overbound": this navigation knows none; use "k_sigma"']
+                )
+            grown = np.ones(6)
+            grown[:3] = nav.overbound.factors(self.k)
+            return replace(
+                nav,
+                covariance=nav.covariance * grown[:, None] * grown,
+                common_factor=nav.common_factor * grown[:3, None],
+            )
+        if nav.protection is None:
+            raise ProblemError(
+                "planner.safety",
+                ['= "protection_level": this navigation computes none; use "k_sigma" or "overbound"'],
+            )
+        known = np.asarray((np.isfinite(nav.protection) & (nav.protection > 0.0)).all(-1))
+        level = np.where(known[..., None], nav.protection, 1.0) / self.k
+        covariance = np.zeros_like(nav.covariance)
+        covariance[..., 3:, 3:] = nav.covariance[..., 3:, 3:]
+        for axis, column in enumerate((0, 0, 1)):
+            covariance[..., axis, axis] = level[..., column] ** 2
+        return replace(
+            nav,
+            available=nav.available & known,
+            covariance=covariance,
+            common_factor=np.zeros_like(nav.common_factor),
+            forecast=None,
+        )
 
     def margin(self, covariance: Array, normal: Array) -> Array:
         """Inflation k sigma [m]: covariance (..., 3, 3) against normals (..., m, 3) gives (..., m)."""

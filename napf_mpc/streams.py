@@ -29,6 +29,11 @@ class Stream(IntEnum):
     MOVING_ACCELERATION = 10
     MOVING_OBSERVATION = 11
     RARE_EVENT = 12
+    GNSS_START = 13
+    GNSS_COMMON = 14
+    GNSS_WAVES = 15
+    GNSS_NOISE = 16
+    GNSS_PHASES = 17
 
 
 class Numbers(Protocol):
@@ -128,5 +133,46 @@ class NormalSequence:
                 self._steps[:, first : first + 64] = self._series[first : first + 64].T
             self._next = 0
         step: NDArray[np.float64] = self._steps[self._next].reshape(self._shape)
+        self._next += 1
+        return step
+
+
+class NormalRows:
+    """Standard-normal rows of many streams, one array (run, uav, width) a step, without holding them all.
+
+    One generator a run and UAV draws row after row, so a row of satellites costs one stream. The numbers do
+    not depend on how far ahead they are drawn.
+
+    Parameters
+    ----------
+    seed : int or Numbers
+        Campaign seed, or what stands for it.
+    runs : range
+        Indices of the runs.
+    stream : Stream
+        What the numbers are for.
+    uavs : int
+        How many.
+    width : int
+        Numbers of one row; other widths are other numbers.
+    ahead : int
+        Rows drawn at once.
+    """
+
+    def __init__(
+        self, seed: Seed, runs: range, stream: Stream, uavs: int, width: int, ahead: int = 32
+    ) -> None:
+        self._generators = [generator(seed, run, stream, uav) for run in runs for uav in range(uavs)]
+        self._rows = np.empty((len(self._generators), ahead, width))
+        self._shape = (len(runs), uavs, width)
+        self._next = ahead
+
+    def take(self) -> NDArray[np.float64]:
+        """Return the rows of the next step (run, uav, width); not to be kept beyond the next call."""
+        if self._next == self._rows.shape[1]:
+            for rows, source in zip(self._rows, self._generators, strict=True):
+                source.standard_normal(out=rows)
+            self._next = 0
+        step: NDArray[np.float64] = self._rows[:, self._next].reshape(self._shape)
         self._next += 1
         return step

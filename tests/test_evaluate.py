@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Motion = Callable[[float], Any]
 
 TICK_S = 0.1
-OF_NAVIGATION = ("shape_floor_m", "within_k_sigma", "nees", "gated_fixes")
+OF_NAVIGATION = ("shape_floor_m", "within_k_sigma", "nees", "gated_fixes", "missed_fixes", "monitor_")
 """Metrics that say what navigation was worth; all others are about the truth alone."""
 ONE_OF_FOUR = np.array([(1.0,), (0.0,), (0.0,), (0.0,)])
 EAST, NORTH, UP = np.eye(3)

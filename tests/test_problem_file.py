@@ -24,7 +24,7 @@ SHIPPED = shipped_problems()
 NAMES = {
     "potential_surface", "single_uav", "square_8", "square_40", "street_canyon", "nishi_shinjuku",
     "table1_8", "table1_40", "table1_8c", "table1_40c", "study_8s", "study_40s", "study_8c", "study_40c",
-    "crossing_traffic",
+    "crossing_traffic", "street_canyon_gnss", "nishi_shinjuku_gnss", "nagoya_replay", "berlin_replay",
 }  # fmt: skip
 SMALL = """
 [formation]
@@ -172,7 +172,7 @@ WORLDS = '"empty", "list", "lanes", "scatter", "forest", "street_canyon" or "cit
 SHAPES = '"sphere", "cylinder", "box" or "prism"'
 REFERENCE = "{ source = 'a', runs = 3, collision_risk = "
 PLANNERS = '"apf", "napf", "napf_guided", "qp" or "qp_unguided"'
-ERRORS = '"gauss_markov", "constant" or "recorded"'
+ERRORS = '"gauss_markov", "constant", "recorded" or "gnss"'
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,19 @@ ERRORS = '"gauss_markov", "constant" or "recorded"'
         ("world.obstacles[0].shape", "ball", f' = "ball": must be {SHAPES}'),
         ("world.obstacles[1]", "{}", f".shape: missing; must be {SHAPES}"),
         ("world.obstacles[1]", "4", f" = 4: must be a table with shape = {SHAPES}"),
-        ("navigation.kind", "gnss", f' = "gnss": not built in this version; must be {ERRORS}'),
+        ("navigation.kind", "gns", f' = "gns": must be {ERRORS}; did you mean gnss?'),
+        (
+            "navigation",
+            "{kind = 'gnss', start_gps_time = 'noon'}",
+            '.start_gps_time = "noon": must be GPS time',
+        ),
+        ("navigation", "{kind = 'gnss', common_mode_share = 0.5}", ": common_mode_share must be left out"),
+        ("navigation", "{kind = 'gnss', systems = ['QZSS']}", ": systems: QZSS is in files only"),
+        (
+            "navigation",
+            "{kind = 'gnss', origin_latitude_deg = 1}",
+            ": origin_latitude_deg and origin_longitude",
+        ),
         ("planner.kind", "nafp", f' = "nafp": must be {PLANNERS}; did you mean napf?'),
         ("planner.confidence", "1.0", " = 1.0: must be > 0 and < 1"),
         (
@@ -308,7 +320,8 @@ def test_folders_and_missing_files(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(ProblemError, match=r"no such file.*did you mean table1_8"):
         load_problem("tabel1_8")
     with pytest.raises(
-        ProblemError, match=r"no such file.*shipped problems: crossing_traffic, nishi_shinjuku"
+        ProblemError,
+        match=r"no such file.*shipped problems: berlin_replay, crossing_traffic, nagoya_replay, nishi_",
     ):
         load_problem("zzz")
     for odd in ("", "a\0b", "x" * 5000, "\x1b[2J"):

@@ -43,6 +43,8 @@ def test_data_files_are_those_that_the_problem_names() -> None:
         "city_tokyo_nishi_shinjuku/buildings.geojson",
         "gnss_nagoya_spp/nav_error_enu_1Hz.csv",
     ]
+    assert provenance.data_files(load_problem("nishi_shinjuku_gnss"))[1:] == ["gnss_nagoya_spp/broadcast.nav"]
+    assert provenance.data_files(load_problem("street_canyon_gnss")) == []
     against_truth = {"navigation": {"kind": "recorded", "file": "a.pos", "truth_file": "b.pos"}}
     assert provenance.data_files(load_problem("table1_8", against_truth)) == ["a.pos", "b.pos"]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napf_mpc.streams import NormalSequence, Stream, generator, normals, uniforms
+from napf_mpc.streams import NormalRows, NormalSequence, Stream, generator, normals, uniforms
 
 Draw = Callable[[int, range, Stream, int, int, int], NDArray[np.float64]]
 DRAWS = pytest.mark.parametrize("draw", [normals, uniforms])
@@ -62,6 +62,18 @@ def test_step_by_step_they_are_the_same_numbers(ahead: int, uavs: int) -> None:
     sequence = NormalSequence(5, range(2, 5), Stream.OWN_ERROR, uavs, ahead=ahead)
     for step in range(20):
         np.testing.assert_array_equal(sequence.take(), whole[..., step])
+
+
+@pytest.mark.parametrize("ahead", [1, 7, 64])
+def test_rows_are_the_same_however_far_ahead_and_with_whom_they_are_drawn(ahead: int) -> None:
+    rows = NormalRows(5, range(2, 5), Stream.GNSS_NOISE, 3, 11, ahead)
+    alone = NormalRows(5, range(3, 4), Stream.GNSS_NOISE, 2, 11)
+    whole = generator(5, 3, Stream.GNSS_NOISE, 1).standard_normal((20, 11))
+    for step in range(20):
+        taken = rows.take()
+        assert taken.shape == (3, 3, 11)
+        np.testing.assert_array_equal(taken[1, 1], whole[step])
+        np.testing.assert_array_equal(alone.take()[0, 1], whole[step])
 
 
 def test_laws() -> None:

@@ -19,7 +19,14 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows, along_rows
+from napf_mpc.constraints.clearance_rows import (
+    NEWTON_STEPS,
+    contact_rows,
+    held_distances,
+    influence_rows,
+    shortfalls,
+)
+from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.constraints.passage import margins_beside, passage_margins
 from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins, sigma_along
 from napf_mpc.jit import compiled
@@ -41,8 +48,6 @@ times that leaves room for other weights, and is still an order below what spoil
 """
 CONTACT_W2 = 100.0
 """Quadratic price of a contact slack [1/(m^2 s)]: spreads what cannot be met over the stages."""
-NEWTON_STEPS = 6
-"""Steps to the last digit from where :func:`distance_of_force` starts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,20 +124,6 @@ class Gaps:
             gaps.influence.reshape(points, count),
         )
         return gaps
-
-    def rows_beyond(self, position: Array, distance: Array | float) -> tuple[Array, Array]:
-        """Coefficients and lower bounds of rows "shifted distance >= distance" on the position."""
-        return self.normal, along_rows(self.normal, position) + (distance - self.shifted)
-
-    def opening(self, horizon: Horizon, distance_m: Array | float, speed_mps: float) -> Array:
-        """Shifted distances (run, uav, N, M) to ask for, where one that is short now opens at a speed [m].
-
-        Now is the plan's first node, seen along each row's own normal.
-        """
-        first = along_rows(self.normal, horizon.position[:, :, :1])
-        here = self.shifted + (first - along_rows(self.normal, horizon.position))
-        opened = speed_mps * np.cumsum(horizon.step_s)[:, None]
-        return np.asarray(np.minimum(distance_m, np.minimum(distance_m, here) + opened))
 
 
 @compiled
@@ -361,25 +352,36 @@ class ObstacleContact(_Shell):
 
     def shortfall(self, horizon: Horizon, position: Array) -> Array:
         """Most that plans (run, uav, N, 3) are inside the margin of an obstacle of their rows [m]."""
-        gaps = self.gaps(horizon, self.extra_m)
-        moved = along_rows(gaps.normal, position) - along_rows(gaps.normal, horizon.position)
-        return np.asarray(np.maximum(self._extra(gaps) - (gaps.shifted + moved), 0.0).max(axis=(2, 3)))
+        gaps, most = self.gaps(horizon, self.extra_m), np.empty(horizon.shape[:2])
+        shortfalls(
+            gaps.normal,
+            gaps.shifted,
+            gaps.sigma,
+            plain(horizon.position),
+            plain(position),
+            *self._extra(),
+            most,
+        )
+        return most
 
-    def _extra(self, gaps: Gaps) -> Array | float:
-        """Distance on top of the margin, one number or (run, uav, N, M) [m]."""
-        return extra_distance(self.extra_m, self.extra_sigmas, gaps.sigma)
+    def _extra(self) -> tuple[float, float]:
+        """Distance on top of the margin at most [m], and sigmas of it, endless without."""
+        return self.extra_m, math.inf if self.extra_sigmas is None else self.extra_sigmas
 
     def rows(self, horizon: Horizon) -> LinearRows:
         """Rows ``n^T p >= n^T p_lin - rho_bar(p_lin) + extra - s`` [m]."""
         gaps = self.gaps(horizon, self.extra_m)
-        asked = self._extra(gaps)
-        if self.opening_mps is not None:
-            asked = gaps.opening(horizon, asked, self.opening_mps)
-        jac, lower = gaps.rows_beyond(horizon.position, asked)
+        lower = np.empty(gaps.shifted.shape)
+        opening = math.inf if self.opening_mps is None else self.opening_mps
+        contact_rows(
+            gaps.normal, gaps.shifted, gaps.sigma, plain(horizon.position), *self._extra(), opening,
+            np.cumsum(horizon.step_s), lower,
+        )  # fmt: skip
         slack = (*horizon.shape, 1)
         return LinearRows(
-            "position", jac, lower, None, np.full(slack, self.w1), np.full(slack, self.w2), shared_slack=True
-        )
+            "position", gaps.normal, lower, None, np.full(slack, self.w1), np.full(slack, self.w2),
+            shared_slack=True,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -416,24 +418,20 @@ class ObstacleInfluence(_Shell):
     def rows(self, horizon: Horizon) -> LinearRows:
         """Rows ``n^T p >= n^T p_lin + rho_t - rho_bar(p_lin) - s`` [m], each with a slack of its own."""
         settings = horizon.problem.planner
-        gaps = self.gaps(horizon, settings.influence_m)
-        floor: Array | float = settings.min_distance_m
-        if math.isfinite(self.most) and settings.repulsive_gain > 0.0:
-            ratio = self.most / (self.per_speed * settings.repulsive_gain)
-            floor = np.maximum(floor, distance_of_force(ratio, gaps.influence))
-        weight, target = influence_model(gaps.shifted, settings.repulsive_gain, gaps.influence, floor)
-        jac, lower = gaps.rows_beyond(horizon.position, target)
-        w2 = self.per_speed * weight
-        free = w2 <= 0.0
-        return LinearRows(
-            "position",
-            jac,
-            np.where(free | ~np.isfinite(gaps.shifted), -np.inf, lower),
-            None,
-            np.zeros(w2.shape),
-            # A slack without a price would be undetermined; this one's row is switched off.
-            np.where(free, 1.0, w2),
+        gaps, gain = self.gaps(horizon, settings.influence_m), settings.repulsive_gain
+        held, ratio = np.empty(gaps.shifted.shape), math.inf
+        if math.isfinite(self.most) and gain > 0.0:
+            ratio = self.most / (self.per_speed * gain)
+        held_distances(
+            gaps.shifted, gaps.influence, settings.min_distance_m, ratio, ratio ** (1.0 / 3.0), held
         )
+        lower, w2 = np.empty(held.shape), np.empty(held.shape)
+        influence_rows(
+            gaps.normal, gaps.shifted, gaps.influence, plain(horizon.position), gain, self.per_speed, held,
+            # NumPy's own power, whose last bit is not everybody's.
+            held**4, lower, w2,
+        )  # fmt: skip
+        return LinearRows("position", gaps.normal, lower, None, np.zeros(w2.shape), w2)
 
 
 def distance_of_force(ratio: float, influence_m: Array) -> Array:

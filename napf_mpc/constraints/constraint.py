@@ -153,6 +153,9 @@ class LinearRows:
     """(run, uav, N, m) quadratic slack penalty per unit squared and second; None for hard rows."""
     shared_slack: bool = False
     """Whether the rows of a stage share one slack; w1 and w2 are then (run, uav, N, 1)."""
+    steady: bool = False
+    """Promise that these arrays are the same for every run and UAV, and that nobody writes into them again: a
+    solver that is given this very object step after step need not read it anew."""
 
     @property
     def soft(self) -> bool:

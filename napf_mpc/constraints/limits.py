@@ -111,7 +111,7 @@ class SpeedLimit:
         jac = np.vstack([flat, [0.0, 0.0, 1.0]])
         bound = _everywhere(horizon, np.array([most * math.cos(0.5 * math.pi / n)] * n + [climb]))
         weights = _soft(horizon, n + 1, self.w1, self.w2)
-        return LinearRows("velocity", _everywhere(horizon, jac), -bound, bound, *weights)
+        return LinearRows("velocity", _everywhere(horizon, jac), -bound, bound, *weights, steady=True)
 
 
 def _mission_speed(horizon: Horizon) -> float:
@@ -148,7 +148,7 @@ class TiltLimit:
     def _rows(self, horizon: Horizon) -> LinearRows:
         bound = np.full((*horizon.shape, 2), self.max_rad)
         jac = _everywhere(horizon, np.eye(3)[:2])
-        return LinearRows("attitude", jac, -bound, bound, *_soft(horizon, 2, self.w1, self.w2))
+        return LinearRows("attitude", jac, -bound, bound, *_soft(horizon, 2, self.w1, self.w2), steady=True)
 
 
 @dataclass(frozen=True)
@@ -354,4 +354,5 @@ class InputBox:
             _everywhere(horizon, np.eye(4)),
             _everywhere(horizon, lower),
             _everywhere(horizon, upper),
+            steady=True,
         )

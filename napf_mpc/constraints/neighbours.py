@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.constraints.probability import sigma_along
 from napf_mpc.formation import PathFrame, formation_offsets
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.problem import Formation, FormationMission, Problem
 from napf_mpc.safety_distance import Inflation, directional_sigma
 from napf_mpc.vehicle.plant import plain
@@ -210,14 +210,14 @@ def _shared(factor: Array, cross: Array) -> None:
                         cross[run, i, j, a, b] = one[a, b] + one[b, a]
 
 
-@compiled
+@compiled_bare
 def _plane(
     x: float, y: float, z: float, distance_m: float, stretch: float, aside: Array, normal: Array
 ) -> float:
     """Write the normal that :func:`tangent` returns of an offset (x, y, z), and return its reach [m]."""
     flattened = z / stretch**2
     if math.sqrt(x * x + y * y + z * z) < TOUCH_M:
-        normal[:] = aside
+        normal[0], normal[1], normal[2] = aside[0], aside[1], aside[2]
     else:
         length = math.sqrt(x * x + y * y + flattened * flattened)
         normal[0], normal[1], normal[2] = x / length, y / length, flattened / length

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.constraints.probability import BALL, mission_share, reach_margin, sigma_along
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.world.distance import SPHERE, A, Solids
 
@@ -79,7 +79,7 @@ def _fill(
             out[i, j] = reach_margin(BALL, radii[i], 1.0, across[j], k, share)
 
 
-@compiled
+@compiled_bare
 def _place(value: float, low: float, high: float, count: int) -> tuple[int, float]:
     """Interval of a logarithmic axis in which a value > 0 lies, and how far in it."""
     at = np.log(min(max(value, low), high) / low) / np.log(high / low) * (count - 1)
@@ -87,7 +87,7 @@ def _place(value: float, low: float, high: float, count: int) -> tuple[int, floa
     return index, at - index
 
 
-@compiled
+@compiled_bare
 def sigmas_beside(margins: PassageMargins, radius: float, sigma: float, g: float) -> float:
     """Sigmas to keep from a ball.
 
@@ -113,7 +113,7 @@ def sigmas_beside(margins: PassageMargins, radius: float, sigma: float, g: float
     return float(near + a * (far - near))
 
 
-@compiled
+@compiled_bare
 def volume(covariance: Array) -> float:
     """Root of a covariance's determinant [m^3]."""
     c = covariance

@@ -25,7 +25,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -75,7 +75,7 @@ def ellipsoid_half_space_bound(offset: Array, covariance: Array, half_axes: Arra
     return half_space_probability(length - 1.0, np.sqrt(variance))
 
 
-@compiled
+@compiled_bare
 def sigma_along(c: Array, x: float, y: float, z: float) -> float:
     """Standard deviation along a unit vector of an error of covariance c (3, 3) [m].
 

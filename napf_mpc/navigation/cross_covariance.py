@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -153,7 +153,7 @@ def report_axes(cross: Array, since: Array, covariance: Array) -> None:
                         covariance[r, i, 3 * q + b, 3 * p + a] = value
 
 
-@compiled
+@compiled_bare
 def _advance(m: Array, f: Array, g: Array, v: Array, w: Array, correlation: float, half: Array) -> None:
     """Replace m by f m g^T + correlation v w^T."""
     for row in range(4):

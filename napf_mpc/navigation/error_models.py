@@ -20,7 +20,7 @@ from napf_mpc.navigation.processes import (
     swinging_sigma,
 )
 from napf_mpc.navigation.replay import RecordedErrors, recorded_errors
-from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Recorded
+from napf_mpc.problem import ConstantBias, GaussMarkov, Gnss, Navigation, Recorded
 from napf_mpc.streams import Seed, Stream, normals, uniforms
 
 __all__ = [
@@ -81,6 +81,10 @@ def position_errors(
             return constant_errors(navigation, own[..., 0], common[..., 0], share, epochs)
         case Recorded():
             return recorded_errors(navigation, seed, runs, uav_count, epochs, data_folder)
+        case Gnss():
+            raise ProblemError(
+                "navigation.kind", ['is "gnss": its errors depend on the place; see navigation.gnss_fixes']
+            )
 
 
 # --------------------------------------------------------------------------------------- Gauss-Markov

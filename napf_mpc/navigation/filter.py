@@ -8,7 +8,8 @@ that accelerometers measured. It takes as known
 - the laws of the GNSS velocity's noise, of the accelerometer's noise and of its bias, as the problem gives
   them;
 - attitude, and with it gravity in the body, without error;
-- the common-mode share, for what it reports of two UAVs.
+- the common-mode share, for what it reports of two UAVs. (What emulated receivers have in common lasts for
+  the mission and is kept out of the filter, see :mod:`napf_mpc.navigation.filtered`.)
 
 The axes are filtered apart. Where a fix reports a covariance between axes, that is not used to estimate, but
 carried through the gains that are, so the reported covariance has it.
@@ -23,10 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation import cross_covariance, kalman
+from napf_mpc.navigation.fix import is_symmetric
 from napf_mpc.navigation.forecast import CovarianceForecast, ForecastModel, drifts
+from napf_mpc.navigation.monitor import InnovationMonitor, MonitorEvent, squared_innovations
 from napf_mpc.navigation.sensors import bias_memory
 from napf_mpc.navigation.solution import NavSolution
-from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Recorded
+from napf_mpc.problem import ConstantBias, GaussMarkov, Gnss, Navigation, Recorded
 
 __all__ = ["GATE_PATIENCE_S", "RECEIVER_NOISE_M", "FilterModel", "KalmanFilter"]
 
@@ -75,6 +78,8 @@ class FilterModel:
     """Largest innovation in its sigmas; 0 for none."""
     coast_sigma_m: float
     """Largest sigma of an axis with which a solution without a fix counts as available [m]."""
+    monitored: bool = False
+    """Whether innovations are watched, and sigmas that are too small scaled."""
 
     @classmethod
     def of_navigation(cls, navigation: Navigation, period_s: float, ticks_per_epoch: int) -> FilterModel:
@@ -86,7 +91,7 @@ class FilterModel:
                 times = [navigation.correlation_time_s if own is None else own] * 3
             case ConstantBias():
                 times = [math.inf if own is None else own] * 3
-            case Recorded():
+            case Recorded() | Gnss():
                 assert own is not None
                 times = [own] * 3
         barometer = isinstance(navigation, Recorded) and navigation.vertical == "barometer"
@@ -101,7 +106,7 @@ class FilterModel:
             error_noise=-np.expm1(-2.0 * lags),
             common_share=share,
             fixless_axis=np.array([False, False, barometer]),
-            coupled=isinstance(navigation, Recorded),
+            coupled=isinstance(navigation, Recorded | Gnss),
             velocity_sigma_mps=navigation.gnss_velocity_sigma_mps,
             bias_sigma_mps2=navigation.accelerometer_bias_mps2,
             bias_memory=bias_memory(navigation, period_s),
@@ -110,6 +115,7 @@ class FilterModel:
             velocity_change_noise=navigation.accelerometer_noise_mps_rts**2 * period_s,
             gate=navigation.innovation_gate_sigma,
             coast_sigma_m=navigation.filter_coast_sigma_m,
+            monitored=navigation.monitor == "innovations",
         )
 
     def forecast(self) -> ForecastModel:
@@ -137,7 +143,7 @@ class KalmanFilter:
 
     Each begins with the first fix that it is given, at t = 0 also with one that is carried on from before:
     position = fix, with the reported sigma; velocity = GNSS velocity; bias zero, with its sigma. After
-    :data:`GATE_PATIENCE_S` of refused fixes it does so again.
+    :data:`GATE_PATIENCE_S` of fixes that the gate refused it does so again.
 
     Parameters
     ----------
@@ -155,10 +161,13 @@ class KalmanFilter:
         self._used = np.zeros((runs, uavs), dtype=np.bool_)
         self._refused_s = np.zeros((runs, uavs))
         self._refused_fixes = np.zeros((runs, uavs), dtype=np.int64)
+        self._missed_fixes = np.zeros((runs, uavs), dtype=np.int64)
         self._verdict = np.zeros((runs, uavs), dtype=np.int8)
         self._forecast = model.forecast()
         self._sigma = np.full((runs, uavs, 3), np.nan)
         self._epochs_since_new, self._epochs_per_new = 0, 1
+        self._monitor = InnovationMonitor(runs, uavs) if model.monitored else None
+        self._epoch = 0
 
         shared = bool(model.common_share.any()) and 1 < uavs <= cross_covariance.MAX_UAVS
         kept = runs if shared or model.coupled else 0
@@ -177,6 +186,21 @@ class KalmanFilter:
     def refused_fixes(self) -> NDArray[np.int64]:
         """(run, uav) number of fixes refused so far, by the gate or as unusable."""
         return self._refused_fixes.copy()
+
+    @property
+    def missed_fixes(self) -> NDArray[np.int64]:
+        """(run, uav) number of epochs so far at which a fix was due and none came."""
+        return self._missed_fixes.copy()
+
+    @property
+    def monitor(self) -> InnovationMonitor | None:
+        """What watches the innovations; None if nothing does."""
+        return self._monitor
+
+    @property
+    def events(self) -> list[MonitorEvent]:
+        """Alarms of the monitor so far."""
+        return [] if self._monitor is None else self._monitor.events
 
     def predict(self, velocity_change: Array, active: Mask) -> None:
         """Carry the estimates over a tick.
@@ -211,7 +235,8 @@ class KalmanFilter:
         position, velocity : array, shape (run, uav, 3)
             Measured [m, m/s].
         covariance : array, shape (run, uav, 3, 3)
-            Of the position's error, as reported [m^2].
+            Of the position's error, as reported [m^2]. One that is not symmetric is no covariance, and its
+            fix is refused.
         available : array of bool, shape (run, uav)
             Whether there is a fix.
         new : bool
@@ -223,9 +248,16 @@ class KalmanFilter:
         variance = np.einsum("...ii->...i", covariance)
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(variance)
+        sound = is_symmetric(covariance)
+        if not sound.all():
+            sigma = np.where(sound[..., None], sigma, np.nan)
         begins = ~self._begun | (self._refused_s >= GATE_PATIENCE_S - 1e-9)
         first = not self._begun.any()
         has_fix = (available | first) & (new | first)
+        if self._monitor is not None:
+            sigma, covariance = self._watched(position, sigma, covariance, has_fix, begins, active)
+        self._epoch += 1
+        self._missed_fixes += new & ~available & active[:, None]
         self._carried[...] = self._since[-1]
         kalman.correct(
             self._mean,
@@ -252,10 +284,38 @@ class KalmanFilter:
         self._epochs_since_new += 1
         if new:
             self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
-        self._note_verdict(available, active)
+        usable = np.isfinite(position) & np.isfinite(velocity) & np.isfinite(sigma) & (sigma > 0.0)
+        self._note_verdict(available, np.asarray(usable.all(-1)), active)
         self._advance_covariances(covariance, sigma, active)
 
-    def _note_verdict(self, available: Mask, active: Mask) -> None:
+    def _watched(
+        self, position: Array, sigma: Array, covariance: Array, has_fix: Mask, begins: Mask, active: Mask
+    ) -> tuple[Array, Array]:
+        """Sigmas (run, uav, 3) and covariances (run, uav, 3, 3) as the monitor makes them believable."""
+        monitor, model = self._monitor, self._model
+        assert monitor is not None
+        time_s = self._epoch * model.ticks_per_epoch * model.period_s
+        anew = has_fix & begins & self._begun & active[:, None]
+        if anew.any():
+            with np.errstate(invalid="ignore", divide="ignore"):
+                apart = (position - self._mean[..., 0]) ** 2 / (sigma**2 * monitor.scale)
+            known = anew[..., None] & (sigma > 0.0) & np.isfinite(apart).all(-1, keepdims=True)
+            monitor.disagree(np.where(known, apart, np.nan), time_s)
+        measured = (has_fix[..., None] | model.fixless_axis) & ~begins[..., None] & active[:, None, None]
+        squared = np.empty(sigma.shape)
+        squared_innovations(
+            self._mean, self._packed, position, sigma * np.sqrt(monitor.scale), measured,
+            model.error_memory, model.error_noise, RECEIVER_NOISE_M**2, squared,
+        )  # fmt: skip
+        change = monitor.observe(squared, time_s)
+        if (change != 1.0).any():
+            kalman.rescale(self._mean, self._packed, change)
+        if (monitor.scale == 1.0).all():
+            return sigma, covariance
+        root = np.sqrt(monitor.scale)
+        return sigma * root, covariance * root[..., :, None] * root[..., None, :]
+
+    def _note_verdict(self, available: Mask, usable: Mask, active: Mask) -> None:
         verdict = self._verdict
         flying = active[:, None]
         begun = (verdict == kalman.BEGUN) & flying
@@ -264,7 +324,8 @@ class KalmanFilter:
         self._begun |= begun
         self._refused_fixes += refused
         self._used = (self._used | used) & ~refused & available
-        waiting = available & ~self._used & flying
+        # A fix that is no measurement says nothing against the estimate: patience is for those that disagree.
+        waiting = available & usable & ~self._used & flying
         epoch_s = self._model.period_s * self._model.ticks_per_epoch
         self._refused_s = np.where(self._used, 0.0, self._refused_s + epoch_s * waiting)
 

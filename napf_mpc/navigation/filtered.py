@@ -1,14 +1,25 @@
-"""Filtered navigation in the closed loop: sensors see the truth, the filter sees the sensors."""
+"""Filtered navigation in the closed loop: sensors see the truth, the filter sees the sensors.
+
+Of an emulated receiver's errors the part that UAVs have in common (orbits, clocks, atmosphere) stays as it
+is for minutes. No filter can take it out, and one that believed the whole error to change would soon claim to
+have done so. The filter is therefore given the covariance of the rest, S C S^T - L L^T, and L L^T is added to
+what it reports: a Schmidt-Kalman filter's treatment of a constant, but for gains that ignore it. The same L
+is the common factor of the UAVs.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation.filter import FilterModel, KalmanFilter
-from napf_mpc.navigation.fix import PositionErrors
+from napf_mpc.navigation.fix import PlacedErrors, PositionErrors, fixes_of_flight
+from napf_mpc.navigation.gnss_fixes import GnssErrors
+from napf_mpc.navigation.integrity.overbound import Overbound
+from napf_mpc.navigation.monitor import InnovationMonitor
 from napf_mpc.navigation.replay import RecordedErrors
 from napf_mpc.navigation.sensors import Sensors
 from napf_mpc.navigation.solution import NavSolution
@@ -28,7 +39,7 @@ class FilteredNavigation:
     ----------
     navigation : Navigation
         Sensors and filter.
-    errors : PositionErrors
+    errors : PositionErrors or PlacedErrors
         Of the position fixes.
     seed : int or Numbers
         Campaign seed, or what stands for it.
@@ -45,7 +56,7 @@ class FilteredNavigation:
     def __init__(
         self,
         navigation: Navigation,
-        errors: PositionErrors,
+        errors: PositionErrors | PlacedErrors,
         seed: Seed,
         runs: range,
         period_s: float,
@@ -54,7 +65,12 @@ class FilteredNavigation:
     ) -> None:
         uavs = velocity.shape[1]
         self._errors = errors
+        self._fixes = fixes_of_flight(errors)
+        self._lasting: Array | None = None
+        if isinstance(errors, GnssErrors):
+            self._lasting = np.zeros((*velocity.shape[:2], 3, len(errors.scene.names)))
         self._ticks_per_fix = ticks_per_fix
+        self._overbound: Overbound | None = None
         self._sensors = Sensors(navigation, seed, runs, uavs, period_s, velocity)
         self._filter = KalmanFilter(
             FilterModel.of_navigation(navigation, period_s, ticks_per_fix), len(runs), uavs
@@ -64,6 +80,16 @@ class FilteredNavigation:
     def gated_fixes(self) -> NDArray[np.int64]:
         """(run,) number of fixes that were refused so far, of all UAVs."""
         return np.asarray(self._filter.refused_fixes.sum(axis=-1), dtype=np.int64)
+
+    @property
+    def missed_fixes(self) -> NDArray[np.int64]:
+        """(run,) number of epochs so far at which a fix was due and none came, of all UAVs."""
+        return np.asarray(self._filter.missed_fixes.sum(axis=-1), dtype=np.int64)
+
+    @property
+    def monitor(self) -> InnovationMonitor | None:
+        """What watches the innovations; None if nothing does."""
+        return self._filter.monitor
 
     def solution(
         self,
@@ -91,19 +117,41 @@ class FilteredNavigation:
             self._filter.predict(self._sensors.velocity_change(velocity), active)
         if tick % self._ticks_per_fix == 0:
             epoch = tick // self._ticks_per_fix
-            fix = self._errors.fix(epoch)
+            fix = self._fixes.fix(epoch, position)
+            self._overbound = fix.overbound
+            covariance = fix.covariance
+            if self._lasting is not None:
+                self._lasting = np.where(fix.available[..., None, None], fix.common_factor, self._lasting)
+                covariance = covariance - _square(fix.common_factor)
             self._filter.correct(
                 position + fix.error,
                 self._sensors.gnss_velocity(velocity),
-                fix.covariance,
+                covariance,
                 fix.available,
                 _is_new(self._errors, epoch),
                 active,
             )
-        return self._filter.solution(time_s, attitude.copy(), body_rates.copy())
+        found = self._filter.solution(time_s, attitude.copy(), body_rates.copy())
+        if self._lasting is not None:
+            found = _with_lasting(found, self._lasting)
+        # A protection level is one of the fix, and says nothing of an estimate: it ends here.
+        return found if self._overbound is None else replace(found, overbound=self._overbound)
 
 
-def _is_new(errors: PositionErrors, epoch: int) -> bool:
+def _square(factor: Array) -> Array:
+    """L L^T of factors (..., 3, rank)."""
+    return np.asarray(np.einsum("...ak,...bk->...ab", factor, factor))
+
+
+def _with_lasting(found: NavSolution, factor: Array) -> NavSolution:
+    """Add what no filter can take out, an error that stays for the mission, to a filter's report."""
+    lasting = _square(factor)
+    covariance = found.covariance.copy()
+    covariance[..., :3, :3] += lasting
+    return replace(found, covariance=covariance, common_factor=factor, lasting=lasting)
+
+
+def _is_new(errors: PositionErrors | PlacedErrors, epoch: int) -> bool:
     """Whether an epoch's fix is more than the last one repeated: a log slower than the fixes is held."""
     if epoch == 0 or not isinstance(errors, RecordedErrors):
         return True

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["COAST_SIGMA_MPS", "Fix", "PositionErrors", "coasting_variance", "diagonal"]
+from napf_mpc.navigation.integrity.overbound import Overbound
+
+__all__ = [
+    "COAST_SIGMA_MPS",
+    "Fix",
+    "FixSource",
+    "PlacedErrors",
+    "PositionErrors",
+    "coasting_variance",
+    "diagonal",
+    "fixes_of_flight",
+]
 
 Array = NDArray[np.float64]
 
@@ -36,9 +47,16 @@ class Fix:
     """(run, uav, 3, rank) L of the part that UAVs share, as reported [m]: Sigma_ij = L_i L_j^T for i != j."""
     available: NDArray[np.bool_]
     """(run, uav): whether there is a fix at this epoch."""
+    overbound: Overbound | None = None
+    """Overbound of the reported law; None if none is known."""
+    protection: Array | None = None
+    """(run, uav, 2) horizontal and vertical protection level [m], not finite where there is none; None if
+    the receiver computes none."""
 
     def __post_init__(self) -> None:
-        for array in (self.error, self.covariance, self.common_factor, self.available):
+        for array in (self.error, self.covariance, self.common_factor, self.available, self.protection):
+            if array is None:
+                continue
             array.flags.writeable = False
 
 
@@ -53,9 +71,55 @@ class PositionErrors(Protocol):
         """Return the fix of an epoch; epoch 0 is at t = 0."""
 
 
+class FixSource(Protocol):
+    """Fixes of one flight, asked for epoch by epoch."""
+
+    def fix(self, epoch: int, position: Array) -> Fix:
+        """Return the fix of the next epoch, at the true places (run, uav, 3) [m]."""
+
+
+class PlacedErrors(Protocol):
+    """Position errors that depend on the true places, as those of an emulated receiver."""
+
+    @property
+    def period_s(self) -> float:
+        """Time between two epochs [s]."""
+
+    def begin(self) -> FixSource:
+        """Return the fixes of one flight, from epoch 0 on; each flight meets the same errors."""
+
+
+class _DrawnFixes:
+    """Fixes whose errors were drawn beforehand, wherever the UAVs are."""
+
+    def __init__(self, errors: PositionErrors) -> None:
+        self._errors = errors
+
+    def fix(self, epoch: int, position: Array) -> Fix:
+        return self._errors.fix(epoch)
+
+
+def fixes_of_flight(errors: PositionErrors | PlacedErrors) -> FixSource:
+    """Return the fixes of one flight, whatever its errors depend on."""
+    begin = getattr(errors, "begin", None)
+    return _DrawnFixes(cast(PositionErrors, errors)) if begin is None else cast(FixSource, begin())
+
+
 def coasting_variance(age_s: Array) -> Array:
     """Variance that a time without a fix adds to each axis [m^2], any shape."""
     return (COAST_SIGMA_MPS * age_s) ** 2
+
+
+def is_symmetric(covariance: Array) -> NDArray[np.bool_]:
+    """Whether matrices (..., 3, 3) are symmetric to a millionth of their sigmas; others are no covariances.
+
+    What is not finite or has no positive variances is not judged here.
+    """
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.einsum("...ii->...i", covariance))
+        apart = np.abs(covariance - np.swapaxes(covariance, -1, -2))
+        astray = apart > 1e-6 * sigma[..., :, None] * sigma[..., None, :]
+    return ~np.asarray(astray.any(axis=(-2, -1)))
 
 
 def diagonal(values: Array) -> Array:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation import kalman
 
 __all__ = ["CovarianceForecast", "ForecastModel", "variance_ahead"]
@@ -122,10 +122,22 @@ class CovarianceForecast:
 
         Parameters are those of :meth:`variance`.
         """
-        now = self.packed[..., None, :, 0]
-        factor = self.variance(ahead_s, with_fixes) / np.where(now > 0.0, now, np.inf)
-        # What is not above zero is rounding, and would say "certain"; it says that nothing is known.
-        return np.where(np.isfinite(factor) & (factor > 0.0), factor, 1.0)
+        factor = self.variance(ahead_s, with_fixes)
+        _compare(self.packed, factor)
+        return factor
+
+
+@compiled_bare
+def _compare(packed: Array, factor: Array) -> None:
+    """Divide variances to come (run, uav, N, 3) by those of now, in packed covariances (run, uav, 3, 10)."""
+    for r in range(factor.shape[0]):
+        for i in range(factor.shape[1]):
+            for k in range(factor.shape[2]):
+                for a in range(3):
+                    now = packed[r, i, a, 0]
+                    ratio = factor[r, i, k, a] / (now if now > 0.0 else np.inf)
+                    # What is not above zero is rounding, and would say "certain"; nothing is known then.
+                    factor[r, i, k, a] = ratio if 0.0 < ratio < np.inf else 1.0
 
 
 @compiled
@@ -168,84 +180,88 @@ def variance_ahead(
     out : array, shape (run, uav, N, 3)
         Out [m^2].
     """
-    c = np.empty(kalman.PACKED)
+    # Axis beside axis: each is a chain of sums that wait for each other, and three chains wait side by side.
+    c, usable = np.empty((3, kalman.PACKED)), np.empty(3, dtype=np.bool_)
     period = drift.shape[0] - 1
     for r in range(packed.shape[0]):
         for i in range(packed.shape[1]):
             for a in range(3):
-                c[:] = packed[r, i, a]
-                s = sigma[r, i, a]
-                usable = np.isfinite(s) and s > 0.0
-                now, to_epoch, to_new = 0, ticks_to_epoch, epochs_to_new
-                for k in range(ticks.shape[0]):
-                    while now < ticks[k]:
-                        n = min(ticks[k] - now, to_epoch)
-                        _drift(c, drift[n])
-                        now += n
-                        to_epoch -= n
-                        if to_epoch > 0:
-                            continue
-                        to_epoch = period
-                        to_new -= 1
-                        _forget(c, error_memory[a], error_noise[a])
-                        fix = fixes[r, i] and to_new == 0
-                        if usable and (fix or fixless_axis[a]):
-                            _measured(c, 1.0, 0.0, s, position_noise)
-                        if usable and fix:
-                            _measured(c, 0.0, 1.0, 0.0, velocity_noise)
-                        if to_new == 0:
-                            to_new = epochs_per_new
-                    out[r, i, k, a] = c[0]
+                for e in range(kalman.PACKED):
+                    c[a, e] = packed[r, i, a, e]
+                usable[a] = 0.0 < sigma[r, i, a] < np.inf
+            now, to_epoch, to_new = 0, ticks_to_epoch, epochs_to_new
+            for k in range(ticks.shape[0]):
+                while now < ticks[k]:
+                    n = min(ticks[k] - now, to_epoch)
+                    for a in range(3):
+                        _drift(c, a, drift, n)
+                    now += n
+                    to_epoch -= n
+                    if to_epoch > 0:
+                        continue
+                    to_epoch = period
+                    to_new -= 1
+                    fix = fixes[r, i] and to_new == 0
+                    for a in range(3):
+                        _forget(c, a, error_memory[a], error_noise[a])
+                        if usable[a] and (fix or fixless_axis[a]):
+                            _measured(c, a, 1.0, 0.0, sigma[r, i, a], position_noise)
+                        if usable[a] and fix:
+                            _measured(c, a, 0.0, 1.0, 0.0, velocity_noise)
+                    if to_new == 0:
+                        to_new = epochs_per_new
+                for a in range(3):
+                    out[r, i, k, a] = c[a, 0]
 
 
-@compiled
-def _drift(c: Array, step: Array) -> None:
+@compiled_bare
+def _drift(c: Array, a: int, drift: Array, n: int) -> None:
     """Carry an axis over a number of ticks."""
-    pv_, pb_, vb_, left = step[0], step[1], step[2], step[3]
-    pp, pv, pg, pb = c[0], c[1], c[2], c[3]
-    vv, vg, vb, gb, bb = c[4], c[5], c[6], c[8], c[9]
+    pv_, pb_, vb_, left = drift[n, 0], drift[n, 1], drift[n, 2], drift[n, 3]
+    pp, pv, pg, pb = c[a, 0], c[a, 1], c[a, 2], c[a, 3]
+    vv, vg, vb, gb, bb = c[a, 4], c[a, 5], c[a, 6], c[a, 8], c[a, 9]
     # Rows first: what the new p and v have in common with the old v and b.
     p_v, p_b = pv + pv_ * vv + pb_ * vb, pb + pv_ * vb + pb_ * bb
     v_b = vb + vb_ * bb
-    c[0] = pp + pv_ * pv + pb_ * pb + pv_ * p_v + pb_ * p_b + step[4]
-    c[1] = p_v + vb_ * p_b + step[5]
-    c[2] = pg + pv_ * vg + pb_ * gb
-    c[3] = left * p_b + step[6]
-    c[4] = vv + vb_ * vb + vb_ * v_b + step[7]
-    c[5] = vg + vb_ * gb
-    c[6] = left * v_b + step[8]
-    c[8] = left * gb
-    c[9] = left * left * bb + step[9]
+    c[a, 0] = pp + pv_ * pv + pb_ * pb + pv_ * p_v + pb_ * p_b + drift[n, 4]
+    c[a, 1] = p_v + vb_ * p_b + drift[n, 5]
+    c[a, 2] = pg + pv_ * vg + pb_ * gb
+    c[a, 3] = left * p_b + drift[n, 6]
+    c[a, 4] = vv + vb_ * vb + vb_ * v_b + drift[n, 7]
+    c[a, 5] = vg + vb_ * gb
+    c[a, 6] = left * v_b + drift[n, 8]
+    c[a, 8] = left * gb
+    c[a, 9] = left * left * bb + drift[n, 9]
 
 
-@compiled
-def _forget(c: Array, memory: float, noise: float) -> None:
+@compiled_bare
+def _forget(c: Array, a: int, memory: float, noise: float) -> None:
     """Carry the error g from one epoch of fixes to the next."""
-    c[2] *= memory
-    c[5] *= memory
-    c[7] = memory * memory * c[7] + noise
-    c[8] *= memory
+    c[a, 2] *= memory
+    c[a, 5] *= memory
+    c[a, 7] = memory * memory * c[a, 7] + noise
+    c[a, 8] *= memory
 
 
-@compiled
-def _measured(c: Array, h_p: float, h_v: float, h_g: float, noise: float) -> None:
+@compiled_bare
+def _measured(c: Array, a: int, h_p: float, h_v: float, h_g: float, noise: float) -> None:
     """Covariance after a measurement of ``h_p p + h_v v + h_g g``.
 
     Shorter than the filter's own update, which must stay sound for hours; over a horizon the plain difference
     does.
     """
-    p = h_p * c[0] + h_v * c[1] + h_g * c[2]
-    v = h_p * c[1] + h_v * c[4] + h_g * c[5]
-    g = h_p * c[2] + h_v * c[5] + h_g * c[7]
-    b = h_p * c[3] + h_v * c[6] + h_g * c[8]
+    p = h_p * c[a, 0] + h_v * c[a, 1] + h_g * c[a, 2]
+    v = h_p * c[a, 1] + h_v * c[a, 4] + h_g * c[a, 5]
+    g = h_p * c[a, 2] + h_v * c[a, 5] + h_g * c[a, 7]
+    b = h_p * c[a, 3] + h_v * c[a, 6] + h_g * c[a, 8]
     scale = 1.0 / (h_p * p + h_v * v + h_g * g + noise)
-    c[0] -= scale * p * p
-    c[1] -= scale * p * v
-    c[2] -= scale * p * g
-    c[3] -= scale * p * b
-    c[4] -= scale * v * v
-    c[5] -= scale * v * g
-    c[6] -= scale * v * b
-    c[7] -= scale * g * g
-    c[8] -= scale * g * b
-    c[9] -= scale * b * b
+    c[a, 0] -= scale * p * p
+    c[a, 1] -= scale * p * v
+    c[a, 2] -= scale * p * g
+    c[a, 3] -= scale * p * b
+    c[a, 4] -= scale * v * v
+    c[a, 5] -= scale * v * g
+    c[a, 6] -= scale * v * b
+    c[a, 7] -= scale * g * g
+    c[a, 8] -= scale * g * b
+    c[a, 9] -= scale * b * b

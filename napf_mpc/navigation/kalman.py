@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -198,6 +198,36 @@ def correct(
 
 
 @compiled
+def rescale(mean: Array, packed: Array, change: Array) -> None:
+    r"""Take it that the sigmas of fixes were too small so far, in place.
+
+    The error's state g counts in units of the sigma, so it shrinks by the sigma's growth and
+    :math:`\sigma g` stays what it was. Where the sigma grows, so does the position's uncertainty, which came
+    from fixes that were believed too much: P becomes D P D with D = diag(sqrt(change), 1, 1, 1).
+
+    Parameters
+    ----------
+    mean, packed : array, shape (run, uav, 3, 4) and (run, uav, 3, 10)
+        States and their covariance; overwritten.
+    change : array, shape (run, uav, 3)
+        Factor on the variance of the fixes; 1 changes nothing.
+    """
+    for r in range(mean.shape[0]):
+        for i in range(mean.shape[1]):
+            for a in range(3):
+                if change[r, i, a] == 1.0:
+                    continue
+                root = np.sqrt(change[r, i, a])
+                mean[r, i, a, 2] /= root
+                c = packed[r, i, a]
+                if root > 1.0:
+                    c[0] *= root * root
+                    c[1] *= root
+                    c[2] *= root
+                    c[3] *= root
+
+
+@compiled_bare
 def _forget(x: Array, c: Array, memory: float, noise: float) -> None:
     """Carry the error g from one epoch of fixes to the next."""
     x[2] *= memory
@@ -207,31 +237,32 @@ def _forget(x: Array, c: Array, memory: float, noise: float) -> None:
     c[8] *= memory
 
 
-@compiled
+@compiled_bare
 def _forget_carried(carried: Array, response: Array, memory: float, noise: float) -> None:
-    carried[2] *= memory
-    response[:] = 0.0
+    for column in range(4):
+        carried[2, column] *= memory
+        response[column] = 0.0
     response[2] = np.sqrt(noise)
 
 
-@compiled
+@compiled_bare
 def _is_measured(position: float, sigma: float) -> bool:
     return bool(np.isfinite(position) and 0.0 < sigma < np.inf)
 
 
-@compiled
+@compiled_bare
 def _position_inside(x: Array, c: Array, position: float, sigma: float, noise: float, gate: float) -> bool:
     spread = c[0] + 2.0 * sigma * c[2] + sigma * sigma * c[7] + noise
     return bool(_inside(position - x[0] - sigma * x[2], spread, gate))
 
 
-@compiled
+@compiled_bare
 def _inside(miss: float, spread: float, gate: float) -> bool:
     """Whether an innovation is inside the gate; one that is not a number never is."""
     return bool(miss * miss <= gate * gate * spread or (gate == 0.0 and np.isfinite(miss)))
 
 
-@compiled
+@compiled_bare
 def _begin(
     x: Array,
     c: Array,
@@ -252,7 +283,7 @@ def _begin(
     c[9] = bias_variance
 
 
-@compiled
+@compiled_bare
 def _unpack(c: Array, full: Array) -> None:
     n = 0
     for row in range(4):
@@ -262,7 +293,7 @@ def _unpack(c: Array, full: Array) -> None:
             n += 1
 
 
-@compiled
+@compiled_bare
 def _pack(full: Array, c: Array) -> None:
     n = 0
     for row in range(4):
@@ -271,7 +302,7 @@ def _pack(full: Array, c: Array) -> None:
             n += 1
 
 
-@compiled
+@compiled_bare
 def _take_in(
     x: Array, full: Array, k: Array, value: float, h_p: float, h_v: float, h_g: float, noise: float
 ) -> None:
@@ -294,7 +325,7 @@ def _take_in(
             full[row, column] += k[column] * (noise * k[row] - seen)
 
 
-@compiled
+@compiled_bare
 def _take_in_carried(carried: Array, response: Array, k: Array, h_p: float, h_v: float, h_g: float) -> None:
     for column in range(4):
         seen = h_p * carried[0, column] + h_v * carried[1, column] + h_g * carried[2, column]

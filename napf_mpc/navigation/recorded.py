@@ -20,6 +20,7 @@ __all__ = [
     "PosTrack",
     "coverage",
     "errors_against_truth",
+    "halves",
     "read_error_log_csv",
     "read_rtklib_pos",
     "sample_period",
@@ -213,6 +214,28 @@ def sample_period(time_s: Array) -> float:
     """Time between two samples of a log that may have gaps [s]: the usual one of its short steps."""
     steps = np.diff(time_s)
     return float(np.median(steps[steps < 1.5 * np.quantile(steps, 0.1)]))
+
+
+def halves(log: ErrorLog) -> tuple[ErrorLog, ErrorLog]:
+    """First and second half of a log by its epochs, those without a fix included.
+
+    Raises
+    ------
+    DataError
+        One of them has fewer than two epochs with a fix.
+    """
+    middle = len(log.time_s) // 2
+    first, second = (
+        ErrorLog(
+            f"{name} half of {log.source}",
+            log.time_s[part],
+            log.available[part],
+            log.error[part],
+            log.covariance[part],
+        )
+        for name, part in (("first", slice(None, middle)), ("second", slice(middle, None)))
+    )
+    return first, second
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +12,20 @@ from numpy.typing import NDArray
 from napf_mpc.data_folder import find_data_file
 from napf_mpc.errors import DataError
 from napf_mpc.navigation.fix import Fix, coasting_variance
+from napf_mpc.navigation.integrity.overbound import AxisOverbound, Overbound, fit_overbound
 from napf_mpc.navigation.processes import gauss_markov, last_fix
+from napf_mpc.navigation.readers.formats import format_of, read_track
 from napf_mpc.navigation.recorded import (
     ErrorLog,
     errors_against_truth,
+    halves,
     read_error_log_csv,
-    read_rtklib_pos,
     sample_period,
 )
 from napf_mpc.problem import Recorded
 from napf_mpc.streams import Seed, Stream, normals, uniforms
 
-__all__ = ["RecordedErrors", "load_error_log", "recorded_errors", "replay"]
+__all__ = ["RecordedErrors", "flown_part", "load_error_log", "recorded_errors", "replay"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -39,30 +41,56 @@ def load_error_log(config: Recorded, data_folder: Path | None) -> ErrorLog:
     DataError
         The log is missing or unusable.
     """
-    suffix = Path(config.file).suffix.lower()
-    if suffix == ".csv":
+    if Path(config.file).suffix.lower() == ".csv" and config.format == "auto":
         if config.truth_file is not None:
             raise DataError(f"navigation.truth_file: {config.file} holds errors already; leave the truth out")
         return read_error_log_csv(find_data_file(config.file, data_folder))
-    if suffix != ".pos":
-        raise DataError(f"navigation.file = {config.file}: must be an RTKLIB .pos or a .csv file")
+    kind = format_of(config.file, config.format, "navigation.file")
     if config.truth_file is None:
-        raise DataError(f"navigation.truth_file: {config.file} holds positions; name the true ones (.pos)")
-    solution = read_rtklib_pos(find_data_file(config.file, data_folder))
-    return errors_against_truth(solution, read_rtklib_pos(find_data_file(config.truth_file, data_folder)))
+        raise DataError(
+            f"navigation.truth_file: {config.file} holds positions; name the true ones, by the same clock"
+        )
+    truth_kind = format_of(config.truth_file, config.truth_format, "navigation.truth_file")
+    solution = read_track(find_data_file(config.file, data_folder), kind)
+    truth = read_track(find_data_file(config.truth_file, data_folder), truth_kind)
+    return errors_against_truth(solution, truth)
 
 
 def recorded_errors(
     config: Recorded, seed: Seed, runs: range, uav_count: int, epochs: int, data_folder: Path | None
 ) -> RecordedErrors:
     """Draw where each run and UAV starts in the log, and the barometers' errors."""
-    log = load_error_log(config, data_folder)
+    log, overbound = flown_part(load_error_log(config, data_folder), config)
     common = uniforms(seed, runs, Stream.RECORD_OFFSET, 1, 1, 1)[:, 0, 0, 0]
     own = uniforms(seed, runs, Stream.RECORD_OFFSET, uav_count, 2, 1)[:, :, 1, 0]
     barometer = None
     if config.vertical == "barometer":
         barometer = normals(seed, runs, Stream.BAROMETER, uav_count, 1, epochs)[:, :, 0]
-    return replay(config, log, common, own, epochs, barometer)
+    return replace(replay(config, log, common, own, epochs, barometer), overbound=overbound)
+
+
+def flown_part(log: ErrorLog, config: Recorded) -> tuple[ErrorLog, Overbound | None]:
+    """Part of a log that is replayed, and the overbound that the other half gives for it.
+
+    A barometer's height keeps its own law, so its axis grows by nothing. Where two errors of the log are
+    mixed, their shifts may add up: sqrt(c) sigma_1 + sqrt(1 - c) sigma_2 is at most sqrt(2) sigmas of both.
+
+    Raises
+    ------
+    DataError
+        A half is too short.
+    """
+    if config.part == "all":
+        return log, None
+    first, second = halves(log)
+    flown, other = (first, second) if config.part == "first_half" else (second, first)
+    bound = fit_overbound(other)
+    east, north, up = bound.axes
+    if 0.0 < config.common_mode_share < 1.0:
+        east, north, up = (replace(axis, bias=math.sqrt(2.0) * axis.bias) for axis in (east, north, up))
+    if config.vertical == "barometer":
+        up = AxisOverbound(bias=0.0, sigma=1.0, n=up.n, effective_n=up.effective_n)
+    return flown, replace(bound, axes=(east, north, up))
 
 
 def replay(
@@ -139,6 +167,8 @@ class RecordedErrors:
     """(sample, run, uav) whether there is a fix; None if always."""
     source: NDArray[np.int32] | None
     """(sample, run, uav) sample of the last fix; None without outages."""
+    overbound: Overbound | None = None
+    """Fitted to the half of the log that is not replayed; None if all of it is."""
 
     @property
     def period_s(self) -> float:
@@ -175,6 +205,7 @@ class RecordedErrors:
             covariance=cfg.reported_sigma_scale**2 * covariance,
             common_factor=cfg.reported_sigma_scale * factor,
             available=available,
+            overbound=self.overbound,
         )
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation.forecast import CovarianceForecast
+from napf_mpc.navigation.integrity.overbound import Overbound
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.vehicle.plant import plain
 
@@ -47,6 +49,13 @@ class NavSolution:
     """Moving obstacles as tracked now; None in a world without any."""
     forecast: CovarianceForecast | None = None
     """What the filter knows of its covariance to come; None if the law of the errors is not known."""
+    overbound: Overbound | None = None
+    """Overbound of the reported law, from measured errors; None if none is known."""
+    protection: Array | None = None
+    """(run, uav, 2) horizontal and vertical protection level [m], not finite where there is none; None if
+    navigation computes none."""
+    lasting: Array | None = None
+    """(run, uav, 3, 3) part of the position's covariance that nothing measured reduces [m^2]; or None."""
 
     @property
     def position_covariance(self) -> Array:
@@ -82,17 +91,24 @@ class NavSolution:
         array, shape (run, uav, N, 3, 3)
             [m^2].
         """
-        out = np.repeat(self.position_covariance[:, :, None], len(ahead_s), axis=2)
-        if self.forecast is not None:
-            scale = np.sqrt(self.forecast.change(ahead_s, with_fixes))
-            out *= scale[..., :, None] * scale[..., None, :]
+        if self.forecast is None:
+            return np.repeat(self.position_covariance[:, :, None], len(ahead_s), axis=2)
+        change = self.forecast.change(ahead_s, with_fixes)
+        out = np.empty((*change.shape, 3))
+        if self.lasting is None:
+            _stretch(plain(self.covariance), change, out)
+            return out
+        waning = self.covariance.copy()
+        waning[..., :3, :3] -= self.lasting
+        _stretch(plain(waning), change, out)
+        out += self.lasting[:, :, None]
         return out
 
     def trusted(self) -> NDArray[np.bool_]:
         """(run, uav): a fix is there, all numbers are finite, and the covariance of the position is one.
 
         A variance of zero, a negative one or NaN means "unknown", never "certain", and so does a matrix with
-        a negative eigenvalue: such a solution is not to be planned with.
+        a negative eigenvalue or one that is not symmetric: such a solution is not to be planned with.
         """
         trusted = np.empty(self.available.shape, dtype=np.bool_)
         _sound(
@@ -100,6 +116,19 @@ class NavSolution:
             plain(self.covariance), trusted,
         )  # fmt: skip
         return np.asarray(self.available & trusted)
+
+
+@compiled_bare
+def _stretch(covariance: Array, change: Array, out: Array) -> None:
+    """Write covariances (run, uav, N, 3, 3) whose axes have changed by factors (run, uav, N, 3)."""
+    for run in range(out.shape[0]):
+        for uav in range(out.shape[1]):
+            for n in range(out.shape[2]):
+                for a in range(3):
+                    scale = math.sqrt(change[run, uav, n, a])
+                    for b in range(3):
+                        both = scale * math.sqrt(change[run, uav, n, b])
+                        out[run, uav, n, a, b] = covariance[run, uav, a, b] * both
 
 
 @compiled
@@ -117,6 +146,10 @@ def _sound(
             for a in range(6):
                 for b in range(6):
                     fine = fine and np.isfinite(covariance[run, uav, a, b])
+            for a in range(3):
+                for b in range(a):
+                    c = covariance[run, uav]
+                    fine = fine and abs(c[a, b] - c[b, a]) <= 1e-6 * np.sqrt(c[a, a] * c[b, b])
             sound[run, uav] = fine
 
 

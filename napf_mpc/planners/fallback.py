@@ -51,6 +51,12 @@ class Ladder:
         self._hovering_since: Array = np.full((runs, uavs), np.nan)
         self._last: Codes = np.zeros((runs, uavs), dtype=np.int8)
 
+    def all_accepted(self) -> Codes:
+        """What :meth:`decide` says where every plan was accepted."""
+        self._hovering_since = np.full(self._last.shape, np.nan)
+        self._last = np.full(self._last.shape, Action.PLAN, dtype=np.int8)
+        return self._last
+
     def decide(
         self, time_s: float, accepted: Mask, age_s: Array, clear: Mask, causes: NDArray[np.object_]
     ) -> Codes:

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.world.bounding_tree import STACK, BoxTree
 from napf_mpc.world.distance import Solids
 from napf_mpc.world.obstacles import ObstacleSet
@@ -62,12 +62,12 @@ def _cut(solids: Solids, tree: BoxTree, scene_start: NDArray[np.int64], out: Arr
                 before = place
 
 
-@compiled
+@compiled_bare
 def _length(a: Array, b: Array) -> float:
     return math.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
-@compiled
+@compiled_bare
 def _free(
     solids: Solids, tree: BoxTree, scene: int, start: Array, stop: Array, room: float, away: float,
     nodes: NDArray[np.int64], bounds: Array,

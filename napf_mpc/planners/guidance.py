@@ -8,6 +8,7 @@ formation slows, holds in front of it, and if the hold lasts too long, gives up 
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from napf_mpc.constraints.passage import PassageMargins, half_space_margins
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets, synchronisation_error
+from napf_mpc.jit import compiled_bare
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.guide import Guide, Passage
@@ -29,6 +31,7 @@ from napf_mpc.safety_distance import Inflation, rms_sigma
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 def guidance_covariance(nav: NavSolution, trusted: NDArray[np.bool_], ahead: Array | None) -> Array:
@@ -131,6 +134,7 @@ class Guidance:
         time_s: float,
         tracks: Tracks | None = None,
         taut: bool = False,
+        flying: NDArray[np.bool_] | None = None,
     ) -> Guide:
         """Guide from what navigation reports; plans anew when its period has passed.
 
@@ -148,6 +152,8 @@ class Guidance:
             Moving obstacles to slow down for.
         taut : bool
             Whether new plans come with their taut ways, see :mod:`.taut`.
+        flying : array of bool, shape (run,), optional
+            Runs that still fly; the others keep the plans they have.
 
         Returns
         -------
@@ -161,7 +167,7 @@ class Guidance:
         due = time_s >= self._next_s - 1e-9
         if due:
             elapsed = 0.0 if np.isnan(self._last_s) else time_s - self._last_s
-            self._plan(place, elapsed, taut)
+            self._plan(place, elapsed, taut, ~self._given_up if flying is None else flying & ~self._given_up)
             self._last_s = time_s
             self._next_s = time_s + self.settings.period_s
         guide = self._guide(along)
@@ -179,7 +185,7 @@ class Guidance:
         resample_all(profiles, along - self._planned_at, self._step_m, out)
         return out
 
-    def _plan(self, place: Array, elapsed_s: float, taut: bool) -> None:
+    def _plan(self, place: Array, elapsed_s: float, taut: bool, asked: NDArray[np.bool_]) -> None:
         # Stations stand still in the world: a gap must not open and close with where the samples fall.
         step = self.settings.step_m
         along = np.floor(place[..., 0] / step) * step
@@ -191,7 +197,7 @@ class Guidance:
             self._boxes,
             self._obstacles.scene_start,
             self._frame,
-            ~self._given_up,
+            asked,
             along,
             offset,
             self._lanes,
@@ -275,21 +281,66 @@ class Guidance:
         settings, offset = self.settings, self._from(self._profiles, along)
         sigma = np.sqrt(np.maximum(np.einsum("ruab,a,b->ru", self._covariance, *[self._path.along] * 2), 0.0))
         error = synchronisation_error(along, self._slots[:, 0])
-        behind = -error - settings.left_behind_m - 2.0 * sigma
-        worst = behind.max(-1, keepdims=True)
-        wait = np.where((worst > 0.0) & (error > 0.0), np.clip(1.0 - 0.25 * worst, 0.2, 1.0), 1.0)
-        stopped = (self._holding | self._given_up)[:, None]
-        pace = np.where(stopped, 0.0, np.minimum(wait, self._pace[:, None]))
-        reason = np.full(along.shape, Passage.NONE, dtype=np.int8)
-        size = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2).max(-1)
-        reason[size > 0.5] = Passage.DETOUR
-        reason[wait < 1.0] = Passage.WAIT
-        reason[self._squeezing] = Passage.SQUEEZE
-        reason[self._holding] = Passage.HOLD
-        reason[self._given_up] = Passage.NO_PASSAGE
-        breach = np.maximum(self._missing.max(-1, initial=0.0) - settings.spare_m, 0.0)
+        pace, breach = np.empty(along.shape), np.empty(along.shape)
+        reason = np.empty(along.shape, dtype=np.int8)
+        _ask(
+            offset, error, sigma, self._missing, settings.left_behind_m, settings.spare_m, self._pace,
+            self._squeezing, self._holding, self._given_up, pace, reason, breach,
+        )  # fmt: skip
         guide = Guide(self.ahead_m, offset, pace, reason, breach)
         if self._taut is None:
             return guide
         taut = self._from(self._taut, along)
         return replace(guide, taut=taut[..., :2], loose=taut[..., 2])
+
+
+# Codes as plain numbers, for the compiled loop.
+_NONE, _DETOUR, _WAIT, _SQUEEZE, _HOLD, _NO_PASSAGE = map(int, Passage)
+
+
+@compiled_bare
+def _ask(
+    offset: Array, error: Array, sigma: Array, missing: Array, left_behind_m: float, spare_m: float,
+    run_pace: Array, squeezing: Mask, holding: Mask, given_up: Mask, pace: Array, reason: NDArray[np.int8],
+    breach: Array,
+) -> None:  # fmt: skip
+    """Write pace, reason and breach (run, uav) of a :class:`~.guide.Guide`.
+
+    Parameters
+    ----------
+    offset, missing : array, shapes (run, uav, station, 2) and (run, uav, station)
+        Profiles from where the UAVs are, and the shortfalls of the last plan [m].
+    error, sigma : array, shape (run, uav)
+        Synchronisation errors, and standard deviations along the path [m].
+    left_behind_m, spare_m : float
+        Settings.
+    run_pace : array, shape (run,)
+        As the ways ahead allow.
+    squeezing, holding, given_up : array of bool, shape (run,)
+        What has been decided.
+    """
+    for run in range(pace.shape[0]):
+        worst = -np.inf
+        for uav in range(pace.shape[1]):
+            worst = max(worst, -error[run, uav] - left_behind_m - 2.0 * sigma[run, uav])
+        late = min(max(1.0 - 0.25 * worst, 0.2), 1.0)
+        for uav in range(pace.shape[1]):
+            wait = late if worst > 0.0 and error[run, uav] > 0.0 else 1.0
+            stopped = holding[run] or given_up[run]
+            pace[run, uav] = 0.0 if stopped else min(wait, run_pace[run])
+            code, short = _NONE, 0.0
+            for s in range(offset.shape[2]):
+                left, up = offset[run, uav, s, 0], offset[run, uav, s, 1]
+                if math.sqrt(left * left + up * up) > 0.5:
+                    code = _DETOUR
+                short = max(short, missing[run, uav, s])
+            if wait < 1.0:
+                code = _WAIT
+            if squeezing[run]:
+                code = _SQUEEZE
+            if holding[run]:
+                code = _HOLD
+            if given_up[run]:
+                code = _NO_PASSAGE
+            reason[run, uav] = code
+            breach[run, uav] = max(short - spare_m, 0.0)

@@ -8,6 +8,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.jit import compiled_bare
+
 Array = NDArray[np.float64]
 
 
@@ -26,6 +28,10 @@ class Passage(IntEnum):
     """It holds: at this confidence there is no way ahead now, but there may be one soon."""
     NO_PASSAGE = 5
     """It holds for good: no safe passage at this confidence."""
+
+
+HOLD = int(Passage.HOLD)
+"""The same as a plain number, for compiled loops."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +68,10 @@ class Guide:
         """How loose the way is (run, uav, N) at distances ahead (run, uav, N) of UAVs that do not hold."""
         if self.loose is None:
             return np.zeros(ahead_m.shape)
-        index, _ = self._place(ahead_m)
-        loose = np.take_along_axis(self.loose, index, axis=2)
-        return np.where((self.reason >= Passage.HOLD)[..., None], 0.0, loose)
+        out = np.empty(ahead_m.shape)
+        ahead, loose = np.ascontiguousarray(ahead_m), np.ascontiguousarray(self.loose)
+        _loose(ahead, loose, self.reason, self._spacing, out)
+        return out
 
     def at(self, ahead_m: Array | float) -> Array:
         """Offsets at distances ahead, linear between the places and level beyond them [m].
@@ -101,3 +108,15 @@ class Guide:
         place = np.clip(np.asarray(ahead) / self._spacing, 0.0, len(self.ahead_m) - 1.0)
         index = np.minimum(place.astype(np.int64), len(self.ahead_m) - 2)
         return index, place - index
+
+
+@compiled_bare
+def _loose(ahead_m: Array, loose: Array, reason: NDArray[np.int8], spacing_m: float, out: Array) -> None:
+    """Write how loose ways (run, uav, K) are at distances ahead (run, uav, N); not at all where UAVs hold."""
+    last = loose.shape[2] - 1
+    for run in range(out.shape[0]):
+        for uav in range(out.shape[1]):
+            holds = reason[run, uav] >= HOLD
+            for n in range(out.shape[2]):
+                place = min(max(ahead_m[run, uav, n] / spacing_m, 0.0), float(last))
+                out[run, uav, n] = 0.0 if holds else loose[run, uav, min(int(place), last - 1)]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled_bare
 from napf_mpc.planners.guide_clearance import (
     ALONG,
     HIGH,
@@ -60,7 +60,7 @@ def empty_band(stations: int) -> Band:
     )
 
 
-@compiled
+@compiled_bare
 def solve_band(band: Band) -> None:
     """Solve a band system in place, by the block LDL^T factors."""
     own, one, two, right, inverse, lower = band
@@ -126,7 +126,7 @@ def solve_band(band: Band) -> None:
         u1 = x1
 
 
-@compiled
+@compiled_bare
 def smooth_terms(profile: Array, mean: Array, last: Array, step_m: float, prices: Prices, band: Band) -> None:
     """Band system of path, shape, slope, change of slope and hysteresis, written anew."""
     own, one, two, right, _, _ = band
@@ -166,7 +166,7 @@ def smooth_terms(profile: Array, mean: Array, last: Array, step_m: float, prices
         own[s, 2] = 0.0
 
 
-@compiled
+@compiled_bare
 def add_row(own: Array, right: Array, s: int, weight: float, g0: float, g1: float, wanted: float) -> None:
     """Add weight (wanted - g x_s)^2 of station s to a band system."""
     own[s, 0] += weight * g0 * g0
@@ -176,7 +176,7 @@ def add_row(own: Array, right: Array, s: int, weight: float, g0: float, g1: floa
     right[s, 1] += weight * g1 * wanted
 
 
-@compiled
+@compiled_bare
 def take_solids(
     sight: Sight,
     i: int,
@@ -251,7 +251,7 @@ def take_solids(
                 add_row(own, right, s, weight * step_m, g0, g1, wanted)
 
 
-@compiled
+@compiled_bare
 def add_neighbour(
     along: float,
     lane: Array,
@@ -282,7 +282,7 @@ def add_neighbour(
         add_row(own, right, s, weight * step_m, g0, g1, wanted)
 
 
-@compiled
+@compiled_bare
 def band_price(
     profiles: Array, mean: Array, last: Array, missing: Array, step_m: float, prices: Prices
 ) -> float:

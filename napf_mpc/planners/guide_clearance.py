@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.constraints.passage import PassageMargins, sigmas_beside, volume
 from napf_mpc.formation import PathFrame
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled_bare
 from napf_mpc.world.distance import BASE, CYLINDER, SPHERE, TOP, TOUCH_M, A, Solids, X, Y, signed_distance
 from napf_mpc.world.obstacles import ObstacleSet
 
@@ -97,7 +97,7 @@ class Sight(NamedTuple):
     known: NDArray[np.int64]  # (uav, station, layer, 2) first and last cell known, of each layer
 
 
-@compiled
+@compiled_bare
 def round_shortfall(
     x: float, y: float, z: float, radius: float, touched: float, covariance: Array, k: float, need_m: float
 ) -> tuple[float, float, float]:
@@ -117,7 +117,7 @@ def round_shortfall(
     return need_m + k * math.sqrt(max(variance, 0.0)) - (radial - radius), y * scale, z * scale
 
 
-@compiled
+@compiled_bare
 def is_round(near: Array, i: int, entry: int, up: float) -> bool:
     """Whether only the distance from a centre or axis counts at a height: a sphere, or well below a lid."""
     if near[i, entry, ROUND] != 0.0:
@@ -125,7 +125,7 @@ def is_round(near: Array, i: int, entry: int, up: float) -> bool:
     return bool(min(near[i, entry, LID] - up, up - near[i, entry, BOTTOM]) >= near[i, entry, RADIUS])
 
 
-@compiled
+@compiled_bare
 def look(sight: Sight, boxes: SolidBoxes, i: int) -> None:
     """Fill in the table of what UAV i has found, and its covariance in path coordinates."""
     ax = sight.frame.axes
@@ -170,14 +170,14 @@ def look(sight: Sight, boxes: SolidBoxes, i: int) -> None:
                 row[a] = x * ax[a, 0] + y * ax[a, 1] + z * ax[a, 2]
 
 
-@compiled
+@compiled_bare
 def sphere_sigmas(margins: PassageMargins, radius: float, covariance: Array) -> float:
     """Sigmas to keep from a sphere: as with an error of the same volume, equal in all directions."""
     sigma = volume(covariance) ** (1.0 / 3.0)
     return sigmas_beside(margins, radius, sigma, sigma * sigma)
 
 
-@compiled
+@compiled_bare
 def world_place(frame: Frame, along: float, left: float, up: float) -> tuple[float, float, float]:
     """Place in the world of path coordinates [m]."""
     ax = frame.axes
@@ -188,7 +188,7 @@ def world_place(frame: Frame, along: float, left: float, up: float) -> tuple[flo
     )
 
 
-@compiled
+@compiled_bare
 def shortfall(
     solids: Solids,
     i: int,
@@ -236,7 +236,7 @@ def shortfall(
     )
 
 
-@compiled
+@compiled_bare
 def largest_reach(covariance: Array, k: float, need_m: float) -> float:
     """Bound [m] on radius, spare and k sigma over all directions (rows' absolute sums, Gershgorin)."""
     largest = 0.0
@@ -248,7 +248,7 @@ def largest_reach(covariance: Array, k: float, need_m: float) -> float:
     return need_m + k * math.sqrt(largest)
 
 
-@compiled
+@compiled_bare
 def gather(
     boxes: SolidBoxes,
     first: int,
@@ -294,7 +294,7 @@ def gather(
     return count
 
 
-@compiled
+@compiled_bare
 def vertical_room(
     solids: Solids,
     boxes: SolidBoxes,

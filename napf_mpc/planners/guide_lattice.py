@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.planners.guide_clearance import (
     ALONG,
     HIGH,
@@ -38,6 +38,8 @@ Array = NDArray[np.float64]
 HALO = 4
 """Cells on each side of a row of values that are never places: two for steps out, two for steps back in."""
 LAYER_HALO = 2
+NOWHERE = 1 << 30
+"""First place of a row without any; its last is this, negative."""
 FIRST_GUESS = 400.0
 """Price of a profile, per UAV, that the search first takes for an upper bound."""
 
@@ -77,7 +79,7 @@ class Prices(NamedTuple):
     apart: float  # squared lack of separation from another UAV [1/m^2]
 
 
-@compiled
+@compiled_bare
 def bent(square: float, far_m: float) -> float:
     """Square of an offset up to ``far_m``, beyond it the tangent (Huber)."""
     if square <= far_m * far_m:
@@ -85,20 +87,20 @@ def bent(square: float, far_m: float) -> float:
     return far_m * (2.0 * math.sqrt(square) - far_m)
 
 
-@compiled
+@compiled_bare
 def steep(slope: float, limit: float) -> float:
     """Factor on the price of a slope: 1 up to a limit, beyond it the fourth power of the ratio."""
     square = max(1.0, slope / limit) ** 2
     return square * square
 
 
-@compiled
+@compiled_bare
 def steep_limit(left_m: float, prices: Prices) -> float:
     """Slope from which slopes cost more on the way to an offset."""
     return prices.steep_far if abs(left_m) > prices.gentle_m else prices.steep
 
 
-@compiled
+@compiled_bare
 def missing_price(missing: float, prices: Prices) -> float:
     """Price of a shortfall: soft within the spare, steep where the margin itself is breached."""
     if missing <= 0.0:
@@ -130,9 +132,13 @@ class Bench(NamedTuple):
     own: Array  # (layer, cell) places' own prices without what is in the way
     bend: Array  # (layer, cell) squared offsets, bent
     ahead: Array  # (station,) least price of what follows, per squared offset [1/m^2]
+    spans: NDArray[
+        np.int64
+    ]  # (2, layer and one on each side, 2) first and last place of each row that can be
+    # got to, at even and odd stations
 
 
-@compiled
+@compiled_bare
 def list_here(sight: Sight, i: int, lattice: Lattice) -> None:
     """Note which of the solids that UAV i has found reach which stations."""
     near = sight.near
@@ -153,7 +159,7 @@ def list_here(sight: Sight, i: int, lattice: Lattice) -> None:
             sight.known[i, s, v, 1] = -1
 
 
-@compiled
+@compiled_bare
 def _half_step(low: float, high: float, step_m: float) -> float:
     """How far back and forth a place stands for its piece of the path, next to what reaches so far.
 
@@ -163,7 +169,7 @@ def _half_step(low: float, high: float, step_m: float) -> float:
     return 0.5 * step_m if 0.5 * (high - low) < step_m else 0.0
 
 
-@compiled
+@compiled_bare
 def cover(
     sight: Sight, i: int, lattice: Lattice, below: int, s: int, v0: int, v1: int, low: int, high: int
 ) -> None:
@@ -239,7 +245,7 @@ def cover(
                 missing[i, s, v, c] = max(missing[i, s, v, c], short)
 
 
-@compiled
+@compiled_bare
 def _fill_round(
     missing: Array,
     i: int,
@@ -276,7 +282,7 @@ def _fill_round(
         missing[ui, us, uv, c] = max(missing[ui, us, uv, c], short)
 
 
-@compiled
+@compiled_bare
 def any_short(sight: Sight, i: int, lattice: Lattice, below: int, layers: int) -> bool:
     """Whether anything is short for UAV i anywhere on the lattice."""
     cells = 2 * lattice.half + 1
@@ -303,7 +309,7 @@ def any_short(sight: Sight, i: int, lattice: Lattice, below: int, layers: int) -
     return False
 
 
-@compiled
+@compiled_bare
 def bend_offsets(lattice: Lattice, below: int, layers: int, prices: Prices, bend: Array) -> None:
     """Squared offsets (layer, cell) of all places, bent."""
     for v in range(layers):
@@ -313,7 +319,7 @@ def bend_offsets(lattice: Lattice, below: int, layers: int, prices: Prices, bend
             bend[v, c] = bent(left * left + up * up, prices.far_m)
 
 
-@compiled
+@compiled_bare
 def price_ahead(lattice: Lattice, path: float, slope: float, ahead: Array) -> None:
     """Least price of all that follows a station, per squared offset (bent): back to the lane, nothing else.
 
@@ -327,7 +333,7 @@ def price_ahead(lattice: Lattice, path: float, slope: float, ahead: Array) -> No
         ahead[s] = rise * next_one / (rise + next_one)
 
 
-@compiled
+@compiled_bare
 def _own_price(
     left: float, up: float, bend: float, mean: Array, last: Array, i: int, f: int, shape: float, keep: float,
     prices: Prices,
@@ -340,7 +346,7 @@ def _own_price(
     return float(price + keep * min(square, prices.keep_m * prices.keep_m))
 
 
-@compiled
+@compiled_bare
 def _apart_price(
     sight: Sight, lattice: Lattice, below: int, price: float, query: Query, s: int, v: int, c: int
 ) -> float:
@@ -362,7 +368,7 @@ def _apart_price(
     return total
 
 
-@compiled
+@compiled_bare
 def edge_prices(lattice: Lattice, prices: Prices, weight: float, edge: Array) -> None:
     """Prices (2, 3, 2) of steps of so many cells and layers from one station to the next.
 
@@ -377,12 +383,12 @@ def edge_prices(lattice: Lattice, prices: Prices, weight: float, edge: Array) ->
                 edge[far, dc, dv] = weight * prices.slope * factor * square / lattice.step_m
 
 
-@compiled
+@compiled_bare
 def _is_far(c: int, lattice: Lattice, prices: Prices) -> int:
     return 1 if abs(c - lattice.half) * lattice.cell_m > prices.gentle_m else 0
 
 
-@compiled
+@compiled_bare
 def price_of(
     sight: Sight,
     lattice: Lattice,
@@ -427,7 +433,7 @@ def price_of(
     return total
 
 
-@compiled
+@compiled_bare
 def _spread(
     value: Array,
     lowest: int,
@@ -455,7 +461,7 @@ def _spread(
             value[b + v, h + c] += value[b + v, h + c + 1] + per_cell
 
 
-@compiled
+@compiled_bare
 def _relax(
     value: Array,
     bends: Array,
@@ -509,7 +515,7 @@ def _relax(
         value[to, level, c] = x if x + least * bends[layer, column + k] <= limit else np.inf
 
 
-@compiled
+@compiled_bare
 def _pay(
     sight: Sight,
     lattice: Lattice,
@@ -534,14 +540,11 @@ def _pay(
     f = lattice.fine * s
     # What lies far ahead may be thought over again; what is near has been decided.
     keep = prices.keep * (1.0 - s / lattice.stations)
-    v_low, v_high, c_low, c_high = window
-    v0 = v_high + 1
-    v1 = v_low - 1
-    c0 = c_high + 1
-    c1 = c_low - 1
-    for v in range(v_low, v_high + 1):
+    spans, now = bench.spans, s % 2
+    for v in range(window[0], window[1] + 1):
         up = (v - below) * lattice.layer_m
-        for c in range(c_low, c_high + 1):
+        first, last_one = NOWHERE, -NOWHERE
+        for c in range(spans[now, v + 1, 0], spans[now, v + 1, 1] + 1):
             there = value[s, LAYER_HALO + v, HALO + c]
             if not there < np.inf:
                 continue
@@ -554,39 +557,28 @@ def _pay(
                 value[s, LAYER_HALO + v, HALO + c] = np.inf
                 continue
             owns[v, c] = own
-            v0 = min(v0, v)
-            v1 = v
-            c0 = min(c0, c)
-            c1 = max(c1, c)
+            first, last_one = min(first, c), c
+        spans[now, v + 1, 0], spans[now, v + 1, 1] = first, last_one
     anything = query.crowded and s > 0
     for i in range(query.first, query.stop):
         if here_count[i, s] == 0:
             continue
         anything = True
-        for v in range(v0, v1 + 1):
-            if c0 < known[i, s, v, 0] or c1 > known[i, s, v, 1]:
-                cover(sight, i, lattice, below, s, v, v1, c0, c1)
-                break
-    if not anything:
-        for v in range(v0, v1 + 1):
-            for c in range(c0, c1 + 1):
-                if value[s, LAYER_HALO + v, HALO + c] < np.inf:
-                    value[s, LAYER_HALO + v, HALO + c] += owns[v, c]
-        return v0, v1, c0, c1
-    v_low, v_high, c_low, c_high = v0, v1, c0, c1
-    v0 = v_high + 1
-    v1 = v_low - 1
-    c0 = c_high + 1
-    c1 = c_low - 1
-    for v in range(v_low, v_high + 1):
-        for c in range(c_low, c_high + 1):
+        for v in range(window[0], window[1] + 1):
+            first, last_one = spans[now, v + 1, 0], spans[now, v + 1, 1]
+            if first <= last_one and (first < known[i, s, v, 0] or last_one > known[i, s, v, 1]):
+                cover(sight, i, lattice, below, s, v, v, first, last_one)
+    for v in range(window[0], window[1] + 1):
+        first, last_one = NOWHERE, -NOWHERE
+        for c in range(spans[now, v + 1, 0], spans[now, v + 1, 1] + 1):
             there = value[s, LAYER_HALO + v, HALO + c]
             if not there < np.inf:
                 continue
             own = owns[v, c]
-            for i in range(query.first, query.stop):
-                if here_count[i, s] > 0 and missing[i, s, v, c] > 0.0:
-                    own += step * missing_price(missing[i, s, v, c], prices)
+            if anything:
+                for i in range(query.first, query.stop):
+                    if here_count[i, s] > 0 and missing[i, s, v, c] > 0.0:
+                        own += step * missing_price(missing[i, s, v, c], prices)
             there += own
             rest = ahead * bends[v, c]
             if query.crowded and s > 0 and there + rest <= limit:
@@ -595,14 +587,48 @@ def _pay(
                 value[s, LAYER_HALO + v, HALO + c] = np.inf
                 continue
             value[s, LAYER_HALO + v, HALO + c] = there
-            v0 = min(v0, v)
-            v1 = v
-            c0 = min(c0, c)
-            c1 = max(c1, c)
+            first, last_one = min(first, c), c
+        spans[now, v + 1, 0], spans[now, v + 1, 1] = first, last_one
+    return _around(spans, now, window)
+
+
+@compiled_bare
+def _around(
+    spans: NDArray[np.int64], now: int, window: tuple[int, int, int, int]
+) -> tuple[int, int, int, int]:
+    """Smallest window around a window's spans; its first layer is past its last if all are empty."""
+    v0, v1, c0, c1 = window[1] + 1, window[0] - 1, window[3] + 1, window[2] - 1
+    for v in range(window[0], window[1] + 1):
+        if spans[now, v + 1, 0] <= spans[now, v + 1, 1]:
+            v0, v1 = min(v0, v), v
+            c0, c1 = min(c0, spans[now, v + 1, 0]), max(c1, spans[now, v + 1, 1])
     return v0, v1, c0, c1
 
 
-@compiled
+@compiled_bare
+def _begin_spans(spans: NDArray[np.int64], window: tuple[int, int, int, int]) -> None:
+    """Spans of the first station: the whole window."""
+    for v in range(spans.shape[1]):
+        for parity in range(2):
+            spans[parity, v, 0], spans[parity, v, 1] = NOWHERE, -NOWHERE
+    for v in range(window[0], window[1] + 1):
+        spans[0, v + 1, 0], spans[0, v + 1, 1] = window[2], window[3]
+
+
+@compiled_bare
+def _step_spans(spans: NDArray[np.int64], now: int, window: tuple[int, int, int, int]) -> None:
+    """Spans within a window that can be got to from those of the station before: a layer and two cells on."""
+    before = 1 - now
+    for v in range(spans.shape[1]):
+        spans[now, v, 0], spans[now, v, 1] = NOWHERE, -NOWHERE
+    for v in range(window[0] + 1, window[1] + 2):
+        first = min(spans[before, v, 0], min(spans[before, v - 1, 0], spans[before, v + 1, 0]))
+        last = max(spans[before, v, 1], max(spans[before, v - 1, 1], spans[before, v + 1, 1]))
+        if first <= last:
+            spans[now, v, 0], spans[now, v, 1] = max(window[2], first - 2), min(window[3], last + 2)
+
+
+@compiled_bare
 def search_within(
     sight: Sight,
     lattice: Lattice,
@@ -632,19 +658,22 @@ def search_within(
     first, last = max(0, lattice.half - near), min(cells - 1, lattice.half + near)
     if query.aside >= 0.0:
         window = (lowest, highest, 0, cells - 1)
+    spans = bench.spans
+    _begin_spans(spans, window)
     for s in range(lattice.stations):
         if s > 0:
             window = (
                 max(lowest, window[0] - 1), min(highest, window[1] + 1),
                 max(0, window[2] - 2), min(cells - 1, window[3] + 2),
             )  # fmt: skip
+            _step_spans(spans, s % 2, window)
         _clear(value, s, window)
         least = weight * (lattice.step_m * prices.path + bench.ahead[s])
         for v in range(window[0], window[1] + 1):
             if s > 0:
                 # Near the lane, and far aside of it on both sides.
                 for far, c0, c1 in ((1, 0, first - 1), (0, first, last), (1, last + 1, cells - 1)):
-                    low, high = max(window[2], c0), min(window[3], c1)
+                    low, high = max(spans[s % 2, v + 1, 0], c0), min(spans[s % 2, v + 1, 1], c1)
                     if low <= high:
                         _relax(value, bench.bend, s, v, low, high, edge[far], least, limit)
             else:
@@ -673,7 +702,7 @@ def search_within(
     return best
 
 
-@compiled
+@compiled_bare
 def _clear(value: Array, s: int, window: tuple[int, int, int, int]) -> None:
     """Make a window and its surroundings infinite."""
     v0, v1, c0, c1 = window
@@ -685,7 +714,7 @@ def _clear(value: Array, s: int, window: tuple[int, int, int, int]) -> None:
             value[to, row, first + c] = np.inf
 
 
-@compiled
+@compiled_bare
 def _trace(
     value: Array,
     lattice: Lattice,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.constraints.passage import PassageMargins
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.planners.guide_band import (
     Band,
     add_neighbour,
@@ -77,7 +77,7 @@ class Search(NamedTuple):
     shared_gain: float  # the common draft must be cheaper by this factor
 
 
-@compiled
+@compiled_bare
 def resample(profile: Array, shift_m: float, step_m: float, out: Array) -> None:
     """Profile (station, channel) as seen ``shift_m`` farther along; its ends go on beyond."""
     stations = profile.shape[0]
@@ -89,7 +89,7 @@ def resample(profile: Array, shift_m: float, step_m: float, out: Array) -> None:
             out[s, a] = (1.0 - part) * profile[lower, a] + part * profile[lower + 1, a]
 
 
-@compiled
+@compiled_bare
 def mean_profile(profiles: Array, mean: Array) -> None:
     """Mean (station, 2) over UAVs of profiles (uav, station, 2), in place."""
     uavs = profiles.shape[0]
@@ -101,7 +101,7 @@ def mean_profile(profiles: Array, mean: Array) -> None:
             mean[s, a] = total / uavs
 
 
-@compiled
+@compiled_bare
 def _refine(coarse: Array, every: int, fine: Array) -> None:
     for s in range(fine.shape[0]):
         lower = min(s // every, coarse.shape[0] - 2)
@@ -110,7 +110,7 @@ def _refine(coarse: Array, every: int, fine: Array) -> None:
             fine[s, a] = (1.0 - part) * coarse[lower, a] + part * coarse[lower + 1, a]
 
 
-@compiled
+@compiled_bare
 def _blocked(sight: Sight, i: int, lattice: Lattice, below: int) -> bool:
     """Whether anything is short on a UAV's lane."""
     for s in range(lattice.stations):
@@ -122,7 +122,7 @@ def _blocked(sight: Sight, i: int, lattice: Lattice, below: int) -> bool:
     return False
 
 
-@compiled
+@compiled_bare
 def _tight(
     sight: Sight, i: int, offset: Array, last: Array, lattice: Lattice, below: int, layers: int
 ) -> bool:
@@ -182,6 +182,7 @@ def make_scratch(uavs: int, fine: int, most: int, search: Search) -> Scratch:
             np.empty((layers, cells)),
             np.empty((layers, cells)),
             np.empty(stations),
+            np.empty((2, layers + 2, 2), dtype=np.int64),
         ),
         Band(
             np.empty((fine, 3)),

@@ -64,12 +64,14 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         """Command of all UAVs from the reported solution, the map and the guide."""
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
+        nav = self.inflation.informed(nav)
         position, covariance, trusted = self._estimates(nav)
         ahead = None
         if settings.covariance == "expected":
             ahead = nav.position_covariance_ahead(self._horizon_s, with_fixes=True)[:, :, 0]
         room = guidance_covariance(nav, trusted, ahead)
-        guide = self.guidance.step(position, room, trusted, time_s, nav.tracks)
+        flying = None if nav.airborne is None else np.asarray(nav.airborne.any(-1))
+        guide = self.guidance.step(position, room, trusted, time_s, nav.tracks, flying=flying)
         self.guide = guide
         place = self._frame.to_path(position)
         error = synchronisation_error(place[..., 0], self._offsets[:, 0])

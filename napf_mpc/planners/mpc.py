@@ -15,9 +15,10 @@ from napf_mpc.constraints.limits import AltitudeBand, InputBox, SpeedLimit, Tilt
 from napf_mpc.constraints.moving import MovingObstacleContact
 from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
 from napf_mpc.constraints.passage import passage_margins
+from napf_mpc.constraints.probability import sigma_along
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.cohesion import drawn_together
@@ -33,9 +34,10 @@ from napf_mpc.planners.tally import COUNTED, FALL_BACKS, Tally
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem import Planner as Settings
 from napf_mpc.qp import STATES, HorizonQp
-from napf_mpc.safety_distance import Inflation, directional_sigma
+from napf_mpc.safety_distance import Inflation
 from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
+from napf_mpc.vehicle.plant import plain
 from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
 from napf_mpc.world.obstacles import ObstacleSet
 
@@ -65,7 +67,9 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     """Rows of the QP as a problem's settings ask for them."""
     settings = problem.planner
     rows, price, margin = settings.obstacle_rows, settings.contact_price, settings.margin
+    inflation = Inflation.of_problem(problem)
     contact = ObstacleContact(
+        inflation,
         obstacles=rows,
         w1=price,
         extra_m=settings.contact_extra_m,
@@ -75,10 +79,12 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     )
     most = REPULSION_PART * price if price > 0.0 else math.inf
     influence = ObstacleInfluence(
-        obstacles=rows, per_speed=settings.influence_scale, most=most, margin=margin
+        inflation, obstacles=rows, per_speed=settings.influence_scale, most=most, margin=margin
     )
     neighbours = min(NEIGHBOURS, problem.uav_count - 1)
-    apart = NeighbourSeparation(max(1, neighbours), w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS)
+    apart = NeighbourSeparation(
+        max(1, neighbours), inflation=inflation, w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS
+    )
     others: list[Constraint] = [apart] if neighbours else []
     if problem.world.moving:
         count = min(rows, len(problem.world.moving))
@@ -186,6 +192,7 @@ class QpPlanner:
 
     def build(self, nav: NavSolution, time_s: float) -> HorizonQp:
         """Programs of this step, in coordinates whose origin is each UAV's reported position."""
+        nav = self._inflation.informed(nav)
         trusted = nav.trusted()
         state = self._state(nav, trusted)
         carried = self._carried(state, time_s)
@@ -197,6 +204,7 @@ class QpPlanner:
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
         """Solve this step's programs and command what was accepted, or what the ladder says."""
+        nav = self._inflation.informed(nav)
         airborne = np.ones(nav.available.shape, dtype=bool) if nav.airborne is None else nav.airborne
         trusted = nav.trusted() & airborne
         self._tracks = nav.tracks
@@ -208,7 +216,10 @@ class QpPlanner:
             expected = self.problem.planner.covariance == "expected"
             room = guidance_covariance(nav, trusted, covariance[:, :, -1] if expected else None)
             # Raw measurements jump by more than a taut way could gain.
-            guide = self._guidance.step(state[..., POSITION], room, trusted, time_s, taut=nav.filtered)
+            flying = np.asarray(airborne.any(-1))
+            guide = self._guidance.step(
+                state[..., POSITION], room, trusted, time_s, taut=nav.filtered, flying=flying
+            )
         carried = self._carried(state, time_s)
         reference, way = self._references(state, carried, nav, covariance, trusted, guide)
         began = 0.0 if self._clock is None else self._clock()
@@ -218,11 +229,7 @@ class QpPlanner:
         refused = refusals(answer, self._limits)
         upset = np.abs(state[..., 6:10:2]).max(-1) > UPSET_RAD
         accepted = (refused == Refusal.NONE) & trusted & ~upset & (not late)
-        words = _CAUSES[refused]
-        for place, message in answer.messages.items():
-            words[place] = f"{words[place]}: {message}"
-        causes = np.where(upset, "upset", np.where(late, "late", words))
-        causes = np.where(trusted, causes, np.where(airborne, "navigation", ""))
+        causes = None if accepted.all() else _causes(answer, refused, upset, late, trusted, airborne)
         flown, action = self._choose(time_s, state, answer, accepted, trusted & ~upset, causes)
         self._plan, self._answer = flown, answer
         slack = self._contact_slack(answer, flown, accepted)
@@ -255,10 +262,11 @@ class QpPlanner:
         the horizon, by its own covariance (run, uav, N, 3, 3). The rest of an estimate's error does not
         depend on the estimate.
         """
-        passing = nav.position_covariance - covariance[:, :, -1] if nav.filtered else nav.position_covariance
-        passing = np.where(trusted[..., None, None], passing, 0.0)
-        axes = [directional_sigma(passing, axis) for axis in self._frame.axes]
-        return np.stack(axes, axis=-1)
+        sigma = np.empty((*trusted.shape, 3))
+        _along_axes(
+            plain(nav.covariance), plain(covariance), nav.filtered, trusted, plain(self._frame.axes), sigma
+        )
+        return sigma
 
     def _state(self, nav: NavSolution, trusted: Mask) -> Array:
         """State (run, uav, 12) as reported; a UAV that is not trusted stands at its last known place."""
@@ -288,19 +296,19 @@ class QpPlanner:
         guide: Guide | None,
     ) -> tuple[Array, Array]:
         """States (run, uav, N, 12) to track, and of the way that guidance has found."""
-        place, times = state[..., POSITION], self._model.times_s
-        sigma = self._to_be_corrected(nav, trusted, covariance)
+        times = self._model.times_s
+        here = self._slots.here(state[..., POSITION], self._to_be_corrected(nav, trusted, covariance))
         share: Array | float = self.problem.planner.cohesion
         if guide is None:
-            free = reference = way = self._slots.over(place, times, sigma)
+            free = reference = way = self._slots.over_from(here, times)
         else:
-            way = self._slots.over(place, times, sigma, guide)
+            way = self._slots.over_from(here, times, guide)
             if guide.taut is None:
                 return way, way
-            free = self._slots.over(place, times, sigma, guide.on_lanes())
-            reference = self._slots.over(place, times, sigma, guide.pulled())
-            along = self._frame.along_track
-            share = share * guide.loose_at(along(free[..., POSITION]) - along(place)[..., None])
+            free = self._slots.over_from(here, times, guide.on_lanes())
+            reference = self._slots.over_from(here, times, guide.pulled())
+            ahead = self._frame.along_track(free[..., POSITION]) - here.place[..., :1]
+            share = share * guide.loose_at(ahead)
         if carried is not None and len(self._lanes) > 1:
             reference = drawn_together(reference, free, carried[0], trusted, share, self._frame)
         return reference, way
@@ -348,7 +356,9 @@ class QpPlanner:
             covariance = np.repeat(nav.position_covariance[:, :, None], self._model.stages, axis=2)
         else:
             covariance = nav.position_covariance_ahead(self._model.times_s, with_fixes=asked == "expected")
-        return np.where(trusted[..., None, None, None], covariance, np.eye(3))
+        return (
+            covariance if trusted.all() else np.where(trusted[..., None, None, None], covariance, np.eye(3))
+        )
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
@@ -402,18 +412,17 @@ class QpPlanner:
         answer: BatchResult,
         accepted: Mask,
         sound: Mask,
-        causes: NDArray[np.object_],
+        causes: NDArray[np.object_] | None,
     ) -> tuple[Plan, Codes]:
-        """Plans that fly from now on, and by which rung of the ladder."""
+        """Plans that fly from now on, and by which rung of the ladder; no causes if all were accepted."""
         old, step_s = self._plan, self._model.step_s
         new = Plan(
             self.problem.vehicle, self._yaw, time_s, step_s, state,
             _moved(answer.states, np.ascontiguousarray(state[..., POSITION])), answer.inputs,
         )  # fmt: skip
-        if accepted.all():
+        if causes is None:
             self._made_s[:] = time_s
-            no_need = np.zeros(accepted.shape, dtype=bool)
-            return new, self.ladder.decide(time_s, accepted, self._made_s, no_need, causes)
+            return new, self.ladder.all_accepted()
         still = standing_plan(self.problem.vehicle, self._yaw, time_s, step_s, self._anchor)
         # Without navigation nothing tells whether the tail is followed; upset, it cannot be.
         clear, tail = sound & ~accepted, still
@@ -467,8 +476,20 @@ class QpPlanner:
         if len(self._lanes) > 1:
             known = trusted[..., None, None]
             covariance = np.where(known, nav.position_covariance, 0.0)
-            kept = margin_attainable(self.problem, covariance, np.where(known, nav.common_factor, 0.0))
+            shared = np.where(known, nav.common_factor, 0.0)
+            kept = margin_attainable(self.problem, covariance, shared, inflation=self._inflation)
             self.tally.add("margin_short", trusted & ~kept.all(-1))
+
+
+def _causes(
+    answer: BatchResult, refused: Codes, upset: Mask, late: bool, trusted: Mask, airborne: Mask
+) -> NDArray[np.object_]:
+    """Words (run, uav) for why a plan was refused; an empty one for a UAV that does not fly."""
+    words = _CAUSES[refused]
+    for place, message in answer.messages.items():
+        words[place] = f"{words[place]}: {message}"
+    causes = np.where(upset, "upset", np.where(late, "late", words))
+    return np.where(trusted, causes, np.where(airborne, "navigation", ""))
 
 
 def _reasons(action: Codes, trusted: Mask) -> Codes:
@@ -499,6 +520,23 @@ def _moved(states: Array, by: Array) -> Array:
 
 
 @compiled
+def _along_axes(now: Array, ahead: Array, filtered: bool, trusted: Mask, axes: Array, sigma: Array) -> None:
+    """Write sigmas (run, uav, 3) along some axes, of what an estimate's error loses or of a measurement's.
+
+    Covariances come as (run, uav, 6, 6) of now and (run, uav, N, 3, 3) of a plan's stages.
+    """
+    passing, last = np.empty((3, 3)), ahead.shape[2] - 1
+    for run in range(sigma.shape[0]):
+        for uav in range(sigma.shape[1]):
+            for a in range(3):
+                for b in range(3):
+                    kept = ahead[run, uav, last, a, b] if filtered else 0.0
+                    passing[a, b] = now[run, uav, a, b] - kept if trusted[run, uav] else 0.0
+            for n in range(3):
+                sigma[run, uav, n] = sigma_along(passing, axes[n, 0], axes[n, 1], axes[n, 2])
+
+
+@compiled_bare
 def _move(states: Array, by: Array, out: Array) -> None:
     for run in range(states.shape[0]):
         for uav in range(states.shape[1]):

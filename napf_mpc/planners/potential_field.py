@@ -69,6 +69,7 @@ class PotentialFieldPlanner:
         """Command of all UAVs from the reported solution and the map."""
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
+        nav = self.inflation.informed(nav)
         position, covariance, trusted = self._estimates(nav)
         error = synchronisation_error(self._frame.along_track(position), self._offsets[:, 0])
         speed = reference_speed(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.formation import PathFrame, formation_offsets, synchronisation_error
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.planners.guide import Guide
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.qp import STATES
@@ -18,6 +19,19 @@ from napf_mpc.vehicle.plant import plain
 Array = NDArray[np.float64]
 LARGEST_PULL_M = 4.0
 """A slot farther than this counts as this far: the UAV comes back at its speed limit, without a lunge."""
+
+
+class Here(NamedTuple):
+    """Where the UAVs are now, as their references start from it."""
+
+    position: Array
+    """(run, uav, 3) in the world [m]."""
+    place: Array
+    """(run, uav, 3) on the path [m]."""
+    sigma: Array
+    """(run, uav, 3) of what will prove to have been error, along, left and up [m]."""
+    behind: Array
+    """(run, uav) how far the slot is ahead, as far as believed [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +74,27 @@ class SlotReference:
         guide : Guide, optional
             Offsets from the lanes, and pace.
         """
+        return self.over_from(self.here(position, sigma_m), times_s, guide)
+
+    def here(self, position: Array, sigma_m: Array | float = 0.0) -> Here:
+        """Where references start; parameters are those of :meth:`over`."""
         place = self.frame.to_path(position)
         ahead = synchronisation_error(place[..., 0], self.offsets[:, 0])
-        sigma = np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), place.shape)
-        behind = _believed(ahead, sigma[..., 0]) * np.clip(-ahead, -LARGEST_PULL_M, LARGEST_PULL_M)
-        out = np.zeros((*ahead.shape, len(times_s), STATES))
+        sigma = plain(np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), place.shape))
+        behind = np.empty(ahead.shape)
+        _believe(ahead, sigma, behind)
+        return Here(plain(position), place, sigma, behind)
+
+    def over_from(self, here: Here, times_s: Array, guide: Guide | None = None) -> Array:
+        """States to track (run, uav, N, 12), as :meth:`over` makes them."""
+        runs, uavs = here.behind.shape
+        out = np.zeros((runs, uavs, len(times_s), STATES))
         _write(
-            plain(position), place, plain(self.offsets), plain(sigma), behind, self.speed_mps,
-            np.ones(ahead.shape) if guide is None else plain(guide.pace),
+            here.position, here.place, plain(self.offsets), here.sigma, here.behind, self.speed_mps,
+            np.ones((runs, uavs)) if guide is None else plain(guide.pace),
             _NO_BEND if guide is None else plain(guide.ahead_m),
             _NOWHERE if guide is None else plain(guide.offset),
-            plain(times_s), plain(self.frame.axes), self.frame.heading_rad, out,
+            plain(times_s), self.frame.axes, self.frame.heading_rad, out,
         )  # fmt: skip
         return out
 
@@ -128,7 +152,7 @@ def _write(
                 out[run, uav, n, 10] = heading_rad
 
 
-@compiled
+@compiled_bare
 def _bend(ahead_m: Array, bend: Array, along: float, offset: Array, slope: Array) -> None:
     """Write a guide's offset and slope at a distance ahead, as :class:`~.guide.Guide` reads them."""
     spacing, last = ahead_m[1] - ahead_m[0], len(ahead_m) - 1
@@ -146,7 +170,11 @@ def _bend(ahead_m: Array, bend: Array, along: float, offset: Array, slope: Array
         slope[a] = (high - low) / spacing if inside else 0.0
 
 
-def _believed(distance_m: Array, sigma_m: Array) -> Array:
-    """Part of a distance that is not put down to navigation errors."""
-    square = distance_m**2
-    return np.asarray(square / np.maximum(square + sigma_m**2, 1e-12))
+@compiled
+def _believe(ahead: Array, sigma: Array, behind: Array) -> None:
+    """Write the part of how far UAVs are behind (run, uav) that is not put down to navigation errors."""
+    for run in range(behind.shape[0]):
+        for uav in range(behind.shape[1]):
+            square, noise = ahead[run, uav] * ahead[run, uav], sigma[run, uav, 0] * sigma[run, uav, 0]
+            pull = min(max(-ahead[run, uav], -LARGEST_PULL_M), LARGEST_PULL_M)
+            behind[run, uav] = square / max(square + noise, 1e-12) * pull

@@ -39,7 +39,7 @@ class Event:
     cause: str
     """Why the new plan was refused."""
     action: str
-    """What flies instead, a name of :data:`FALL_BACKS`."""
+    """What flies instead, a name of :data:`FALL_BACKS`, or what navigation did about its cause."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class Tally:
     """(run,) most that a flown plan is inside an obstacle's margin, NaN if none was asked for [m]."""
 
     events: list[Event] = field(default_factory=list)
-    """Every time that a UAV took to a fall-back, or to another one; runs count from the block's first."""
+    """Every time that a UAV took to a fall-back, or to another one, and every alarm of the navigation
+    filter's monitor; runs count from the block's first."""
 
     @classmethod
     def none(cls, runs: int) -> Tally:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.constraints.probability import sigma_along
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.planners.guide_clearance import Frame, world_place
 from napf_mpc.world.bounding_tree import STACK, BoxTree
 from napf_mpc.world.distance import Solids
@@ -92,7 +92,7 @@ def pulled_taut(
     return out, loose
 
 
-@compiled
+@compiled_bare
 def _distance_and_lack(
     solids: Solids,
     tree: BoxTree,
@@ -116,13 +116,13 @@ def _distance_and_lack(
     return d, not need <= d  # what is not a number lacks it
 
 
-@compiled
+@compiled_bare
 def _need(sigma: float, k: float, radius_m: float, extra_m: float, extra_sigmas: float) -> float:
     """Distance to keep where the position has a sigma towards the obstacle [m]."""
     return radius_m + k * sigma + min(extra_m, extra_sigmas * sigma)
 
 
-@compiled
+@compiled_bare
 def _sigma_bounds(covariance: Array) -> tuple[float, float]:
     """Bounds on sigma over all directions (Gershgorin)."""
     least, most = np.inf, 0.0

@@ -144,6 +144,7 @@ class _Film:
         self._small = flown.uavs <= MOST_UAVS
         self._contacts = contacts(flown, obstacles, problem.vehicle.radius_m, moving)
         inflates = self._small and self._inflation.k > 0.0 and self._inflation.mode == "shift"
+        inflates = inflates and self._inflation.safety == "k_sigma"
         self._acting = acting(problem, flown, obstacles) if inflates and self._shapes else None
         self._canvas, self._plan, self._side, self._clock = self._still(problem, obstacles)
 

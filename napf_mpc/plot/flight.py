@@ -122,7 +122,10 @@ def flight_title(problem: Problem, flown: Track) -> str:
     name = planner_name(flown.planner)
     if inflation.k == 0.0:
         return name
-    return f"{name}, k = {inflation.k:.3g}" + ("" if inflation.mode == "shift" else " (range)")
+    if inflation.safety == "protection_level":
+        return f"{name}, protection level"
+    bound = ", overbound" if inflation.safety == "overbound" else ""
+    return f"{name}, k = {inflation.k:.3g}{bound}" + ("" if inflation.mode == "shift" else " (range)")
 
 
 def paths_figure(
@@ -296,7 +299,9 @@ def uncertainty_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -
     wide, tall = scale * view.width, scale * view.height
     height = bottom + rows * (tall + title) + top
     page = Page.of_size(PAGE_IN, height, credit_of(problem))
-    inflates = inflation.k > 0.0 and inflation.mode == "shift" and len(obstacles) > 0
+    # Recorded are the reported sigmas: they do not tell other margins.
+    inflates = inflation.k > 0.0 and inflation.mode == "shift" and inflation.safety == "k_sigma"
+    inflates = inflates and len(obstacles) > 0
     seen = acting(problem, flown, obstacles) if inflates else None
     shapes = obstacles.shapes() if inflates else []
     for place, uav in enumerate(shown):

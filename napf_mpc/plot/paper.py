@@ -12,6 +12,7 @@ from napf_mpc.closed_loop import build_scenario
 from napf_mpc.goal_walk import goal_scenes
 from napf_mpc.plot.field import surface_figure, walk_figure
 from napf_mpc.plot.flight import paths_figure, run_figures
+from napf_mpc.plot.sky import gnss_figures
 from napf_mpc.plot.states import angle_figure, axis_figure
 from napf_mpc.plot.style import house_style, save
 from napf_mpc.plot.tracks import Track, track
@@ -32,7 +33,7 @@ def paper_figures(
     ``potential_surface`` is Fig. 3 and ``single_uav`` Fig. 4 (any other problem with a mission of kind goal
     gets both); ``square_8`` is Fig. 5-11 (APF without navigation errors) and 16-20 (APF against NAPF with
     errors, same seed), ``square_40`` Fig. 12-15 and 21-25. Any other formation problem gets the figures of
-    a run for APF and NAPF.
+    a run for APF and NAPF; one with emulated GNSS receivers also the sky and the map of its geometry.
 
     Parameters
     ----------
@@ -63,9 +64,12 @@ def paper_figures(
         planners = ("apf", "napf")
         flown = fly_block(problem, planners, seed, range(1), data_folder, EVERY)
         scenario = build_scenario(problem, seed, range(1), data_folder)
-        return run_figures(
-            problem, name, flown.trajectories, scenario.obstacles, planners, out, scenario.moving
-        )
+        return [
+            *run_figures(
+                problem, name, flown.trajectories, scenario.obstacles, planners, out, scenario.moving
+            ),
+            *gnss_figures(problem, name, seed, out, data_folder),
+        ]
 
     obstacles = build_scenario(problem, seed, range(1), data_folder).obstacles
     calm_first, rough_first = FIRST_NUMBERS[name]

@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult
 from napf_mpc.vehicle.plant import plain
@@ -125,23 +125,46 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
     balanced = np.empty(result.status.shape, dtype=np.bool_)
     first = result.states.shape[-2] * STATES
     _balanced(plain(result.y), first, plain(result.complementarity), limits.complementarity, balanced)
-    # Each test must hold to pass: NaN fails all of them.
-    tests = (
-        (Refusal.SKIPPED, result.status != STATUSES.index(QpStatus.SKIPPED)),
-        (Refusal.STATUS, result.status == STATUSES.index(QpStatus.SOLVED)),
-        (Refusal.NOT_FINITE, finite),
-        (Refusal.INPUT, inside),
-        (Refusal.PRIMAL, result.primal <= limits.primal),
-        (Refusal.DUAL, result.dual <= limits.dual),
-        (Refusal.COMPLEMENTARITY, balanced),
-    )
-    why = np.full(result.status.shape, Refusal.NONE, dtype=np.int8)
-    for refusal, passed in reversed(tests):
-        why[~passed] = refusal
+    status, why = np.ascontiguousarray(result.status), np.empty(result.status.shape, dtype=np.int8)
+    _judge(
+        status, finite, inside, plain(result.primal), plain(result.dual), balanced, limits.primal,
+        limits.dual, why,
+    )  # fmt: skip
     return why
 
 
-@compiled
+# Codes as plain numbers, for the compiled loop.
+_SKIPPED, _SOLVED = STATUSES.index(QpStatus.SKIPPED), STATUSES.index(QpStatus.SOLVED)
+_NONE, _IS_SKIPPED, _BY_STATUS, _BY_NUMBERS, _BY_INPUT, _BY_PRIMAL, _BY_DUAL, _BY_PRODUCT = map(int, Refusal)
+
+
+@compiled_bare
+def _judge(
+    status: NDArray[np.int8], finite: Mask, inside: Mask, primal: Array, dual: Array, balanced: Mask,
+    most_primal: float, most_dual: float, why: NDArray[np.int8],
+) -> None:  # fmt: skip
+    """Write the first test (run, uav) that fails; each must hold to pass, and NaN fails all of them."""
+    for run in range(why.shape[0]):
+        for uav in range(why.shape[1]):
+            code = _NONE
+            if status[run, uav] == _SKIPPED:
+                code = _IS_SKIPPED
+            elif status[run, uav] != _SOLVED:
+                code = _BY_STATUS
+            elif not finite[run, uav]:
+                code = _BY_NUMBERS
+            elif not inside[run, uav]:
+                code = _BY_INPUT
+            elif not primal[run, uav] <= most_primal:
+                code = _BY_PRIMAL
+            elif not dual[run, uav] <= most_dual:
+                code = _BY_DUAL
+            elif not balanced[run, uav]:
+                code = _BY_PRODUCT
+            why[run, uav] = code
+
+
+@compiled_bare
 def _inputs_inside(inputs: Array, matrix: Array, lower: Array, upper: Array, inside: Mask) -> None:
     """Write whether all inputs (run, uav, N, 4) keep rows between bounds; NaN does not."""
     for run in range(inputs.shape[0]):
@@ -156,7 +179,7 @@ def _inputs_inside(inputs: Array, matrix: Array, lower: Array, upper: Array, ins
             inside[run, uav] = keeps
 
 
-@compiled
+@compiled_bare
 def _all_finite(values: Array, finite: Mask) -> None:
     """Clear ``finite`` (run, uav) where a number of values (run, uav, N, m) is not."""
     for run in range(values.shape[0]):
@@ -167,7 +190,7 @@ def _all_finite(values: Array, finite: Mask) -> None:
                         finite[run, uav] = False
 
 
-@compiled
+@compiled_bare
 def _balanced(y: Array, first: int, complementarity: Array, limit: float, balanced: Mask) -> None:
     """Write whether complementarity (run, uav) is small beside the multipliers y (run, uav, m) of the rows.
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from napf_mpc.constraints.constraint import LinearRows
 from napf_mpc.qp import STATES, Array, HorizonModel, HorizonQp, Index, Layout, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult, Mask, WarmStart, checked_guess, why_unusable
 from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, WorkingSet
@@ -52,6 +53,8 @@ class _Home:
     kept: Kept
     lanes: dict[int, Lanes]
     """By their number."""
+    steady: dict[int, LinearRows]
+    """Blocks that stand in the table for all programs, by their place in the horizon."""
 
     @classmethod
     def of(cls, horizon: HorizonQp, maps: SignalMaps | None) -> _Home:
@@ -68,7 +71,7 @@ class _Home:
         return cls(
             horizon.model, layout, maps, RowPlaces.of(layout, maps.place), tuple(first),
             RowTable.empty(CHUNK, families, shelves, n), work, Room.empty(n, soft, len(work.row)),
-            Kept.empty(CHUNK, soft, len(work.row)), {1: Lanes.empty(n, 1)},
+            Kept.empty(CHUNK, soft, len(work.row)), {1: Lanes.empty(n, 1)}, {},
         )  # fmt: skip
 
     def lanes_for(self, count: int) -> Lanes:
@@ -76,6 +79,26 @@ class _Home:
         if count not in self.lanes:
             self.lanes[count] = Lanes.empty(self.layout.stages, count)
         return self.lanes[count]
+
+    def changing(self, rows: tuple[LinearRows, ...], step_s: Array) -> list[tuple[int, int, Blocks]]:
+        """Blocks that have to be gathered program by program, each with its first family and row of slacks.
+
+        Steady ones are gathered here for all programs of the table, once.
+        """
+        blocks = []
+        for n, ((family, shelf), block) in enumerate(zip(self.first, rows, strict=True)):
+            if block.steady and self.steady.get(n) is block:
+                continue
+            self.steady.pop(n, None)
+            arrays = _arrays(block)
+            if block.steady:
+                self.table.sound[:] = 1
+                gather(self.table, np.zeros(CHUNK, dtype=np.int64), family, shelf, step_s, *arrays)
+                if self.table.sound.all():
+                    self.steady[n] = block
+                    continue
+            blocks.append((family, shelf, arrays))
+        return blocks
 
 
 class KernelSolver:
@@ -146,12 +169,13 @@ class KernelSolver:
         guess = (z, y)
         if guesses is not None:
             guess = (_plain(guesses.z).reshape(batch, n), _plain(guesses.y).reshape(batch, m))
-        step_s, blocks = _plain(horizon.model.step_s), _blocks(horizon)
+        step_s = _plain(horizon.model.step_s)
+        blocks = home.changing(horizon.rows, step_s) if batch else []
         todo = np.arange(batch) if asked is None else np.flatnonzero(np.repeat(asked, uavs))
         for first in range(0, len(todo), CHUNK):
             programs = todo[first : first + CHUNK]
             home.table.sound[:] = 1
-            for (family, shelf), arrays in zip(home.first, blocks, strict=True):
+            for family, shelf, arrays in blocks:
                 gather(home.table, programs, family, shelf, step_s, *arrays)
             solve_programs(
                 home.maps, home.places, home.table, programs, home.work, home.room, home.kept,
@@ -200,17 +224,17 @@ for _end, _status in _STATUS.items():
 _NONE = np.empty((0, 0, 0, 0))
 
 
-def _blocks(horizon: HorizonQp) -> tuple[tuple[Array, ...], ...]:
-    """Arrays of each block as :func:`~napf_mpc.solvers.kernel_rows.gather` takes them."""
-    return tuple(
-        (
-            _plain(block.jac),
-            _NONE if block.lower is None else _plain(block.lower),
-            _NONE if block.upper is None else _plain(block.upper),
-            _NONE if block.w1 is None else _plain(block.w1),
-            _NONE if block.w2 is None else _plain(block.w2),
-        )
-        for block in horizon.rows
+Blocks = tuple[Array, Array, Array, Array, Array]
+"""Arrays of a block of rows as :func:`~napf_mpc.solvers.kernel_rows.gather` takes them."""
+
+
+def _arrays(block: LinearRows) -> Blocks:
+    return (
+        _plain(block.jac),
+        _NONE if block.lower is None else _plain(block.lower),
+        _NONE if block.upper is None else _plain(block.upper),
+        _NONE if block.w1 is None else _plain(block.w1),
+        _NONE if block.w2 is None else _plain(block.w2),
     )
 
 

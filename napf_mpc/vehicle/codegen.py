@@ -43,10 +43,10 @@ from math import {functions}
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled_bare
 
 
-@compiled
+@compiled_bare
 def derivative(
     x: NDArray[np.float64], u: NDArray[np.float64], p: NDArray[np.float64], out: NDArray[np.float64]
 ) -> None:

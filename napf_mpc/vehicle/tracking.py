@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.errors import ProblemError
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.problem import Vehicle
 from napf_mpc.vehicle.lqr import hover_gain
 from napf_mpc.vehicle.plant import plain
@@ -138,7 +138,7 @@ def tracking_law(vehicle: Vehicle) -> TrackingLaw:
     )
 
 
-@compiled
+@compiled_bare
 def _shrink(x: float, y: float, z: float, largest: float) -> float:
     """Factor that brings a vector's norm to at most ``largest``: 1 inside, NaN if it is not finite."""
     norm = math.sqrt(x * x + y * y + z * z)
@@ -147,7 +147,7 @@ def _shrink(x: float, y: float, z: float, largest: float) -> float:
     return largest / norm if norm < math.inf else math.nan
 
 
-@compiled
+@compiled_bare
 def _wrap(angle: float) -> float:
     """The same angle in (-pi, pi]; NaN for one that is not finite."""
     if -math.pi < angle <= math.pi:
@@ -197,7 +197,7 @@ def track(
             _clip(wanted, mixer, mixer_inverse, rotor_limit, rotors, out[run, uav])
 
 
-@compiled
+@compiled_bare
 def _errors(
     position: Array,
     velocity: Array,
@@ -239,7 +239,7 @@ def _errors(
     chi[10], chi[11] = _wrap(attitude[2] - ref_yaw), rates[2]
 
 
-@compiled
+@compiled_bare
 def _clip(
     wanted: Array, mixer: Array, mixer_inverse: Array, rotor_limit: float, rotors: Array, out: Array
 ) -> None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.world.distance import length3
 
 STACK = 128
@@ -43,7 +43,7 @@ def _finite_size(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isfinite(corners), np.abs(corners), 0.0)
 
 
-@compiled
+@compiled_bare
 def _middle(lower: float, upper: float) -> float:
     """Middle of an interval; of an endless one, its finite end or zero: only used to sort."""
     if lower == -np.inf:
@@ -120,7 +120,7 @@ def _plant(
     return root, box[:nodes], right[:nodes], first[:nodes], size[:nodes], order
 
 
-@compiled
+@compiled_bare
 def _split(order: NDArray[np.int64], key: NDArray[np.float64], start: int, stop: int, half: int) -> None:
     """Partly sort order[start:stop] so that the keys before `half` are not above those from it on."""
     low = start
@@ -146,7 +146,7 @@ def _split(order: NDArray[np.int64], key: NDArray[np.float64], start: int, stop:
             return
 
 
-@compiled
+@compiled_bare
 def box_distance(box: NDArray[np.float64], node: int, px: float, py: float, pz: float) -> float:
     """Signed distance [m] to the box of a node: at most that of anything within the box."""
     x: float = max(box[node, 0] - px, px - box[node, 3])

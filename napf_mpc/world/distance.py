@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 
 SPHERE = 0
 CYLINDER = 1
@@ -45,7 +45,7 @@ class Solids(NamedTuple):
     vertices: NDArray[np.float64]  # (vertex, 2) [m]
 
 
-@compiled
+@compiled_bare
 def length3(x: float, y: float, z: float) -> float:
     """Euclidean length that neither overflows nor, beyond rounding, differs from sqrt(x^2 + y^2 + z^2)."""
     square = x * x + y * y + z * z
@@ -54,7 +54,7 @@ def length3(x: float, y: float, z: float) -> float:
     return math.hypot(math.hypot(x, y), z)
 
 
-@compiled
+@compiled_bare
 def ball_distance(dx: float, dy: float, dz: float, radius: float) -> tuple[float, float, float, float]:
     """Signed distance [m] of a ball about the origin, and its gradient (d, gx, gy, gz)."""
     radial = length3(dx, dy, dz)
@@ -63,7 +63,7 @@ def ball_distance(dx: float, dy: float, dz: float, radius: float) -> tuple[float
     return radial - radius, dx / radial, dy / radial, dz / radial
 
 
-@compiled
+@compiled_bare
 def signed_distance(
     solids: Solids, i: int, px: float, py: float, pz: float
 ) -> tuple[float, float, float, float]:
@@ -93,7 +93,7 @@ def signed_distance(
     return height, 0.0, 0.0, up
 
 
-@compiled
+@compiled_bare
 def _disc(dx: float, dy: float, radius: float) -> tuple[float, float, float]:
     """Signed distance and gradient of a disc about the origin."""
     radial = length3(dx, dy, 0.0)
@@ -102,7 +102,7 @@ def _disc(dx: float, dy: float, radius: float) -> tuple[float, float, float]:
     return radial - radius, dx / radial, dy / radial
 
 
-@compiled
+@compiled_bare
 def _rectangle(
     dx: float, dy: float, half_x: float, half_y: float, cos: float, sin: float
 ) -> tuple[float, float, float]:
@@ -124,7 +124,7 @@ def _rectangle(
     return over_y, -sin * side_y, cos * side_y
 
 
-@compiled
+@compiled_bare
 def _polygon(solids: Solids, i: int, px: float, py: float) -> tuple[float, float, float]:
     """Signed distance and gradient of the footprint of prism i (even-odd rule)."""
     vertices = solids.vertices
@@ -178,7 +178,7 @@ def _polygon(solids: Solids, i: int, px: float, py: float) -> tuple[float, float
     return sign * d, -sign * (qx / d), -sign * (qy / d)
 
 
-@compiled
+@compiled_bare
 def inside_rings(
     vertices: NDArray[np.float64], ring_start: NDArray[np.int64], first: int, stop: int, px: float, py: float
 ) -> bool:
@@ -197,7 +197,7 @@ def inside_rings(
     return inside
 
 
-@compiled
+@compiled_bare
 def solid_on_left(vertices: NDArray[np.float64], ring_start: NDArray[np.int64], ring: int) -> bool:
     """Whether the solid of the even-odd rule lies to the left of a ring, judged at its longest edge."""
     stop = ring_start[ring + 1]

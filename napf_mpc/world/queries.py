@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.world.bounding_tree import STACK, BoxTree, box_distance
 from napf_mpc.world.distance import BASE, SPHERE, A, Solids, X, Y, ball_distance, length3, signed_distance
 
 
-@compiled
+@compiled_bare
 def nearest_obstacle(
     solids: Solids,
     tree: BoxTree,
@@ -68,7 +68,7 @@ def nearest_obstacle(
     return best, gx, gy, gz, index
 
 
-@compiled
+@compiled_bare
 def two_nearest(
     solids: Solids,
     tree: BoxTree,
@@ -362,14 +362,14 @@ def _candidates(
 # place: a reach may hold ten thousand obstacles.
 
 
-@compiled
+@compiled_bare
 def _set(vectors: NDArray[np.float64], i: int, gx: float, gy: float, gz: float) -> None:
     vectors[i, 0] = gx
     vectors[i, 1] = gy
     vectors[i, 2] = gz
 
 
-@compiled
+@compiled_bare
 def _swap(
     keys: NDArray[np.float64], names: NDArray[np.int64], vectors: NDArray[np.float64], i: int, j: int
 ) -> None:
@@ -379,19 +379,19 @@ def _swap(
         vectors[i, axis], vectors[j, axis] = vectors[j, axis], vectors[i, axis]
 
 
-@compiled
+@compiled_bare
 def _farther(keys: NDArray[np.float64], names: NDArray[np.int64], i: int, j: int) -> bool:
     return bool(keys[i] > keys[j] or (keys[i] == keys[j] and names[i] > names[j]))
 
 
-@compiled
+@compiled_bare
 def _rise(keys: NDArray[np.float64], names: NDArray[np.int64], vectors: NDArray[np.float64], i: int) -> None:
     while i > 0 and _farther(keys, names, i, (i - 1) // 2):
         _swap(keys, names, vectors, i, (i - 1) // 2)
         i = (i - 1) // 2
 
 
-@compiled
+@compiled_bare
 def _sink(
     keys: NDArray[np.float64], names: NDArray[np.int64], vectors: NDArray[np.float64], i: int, count: int
 ) -> None:

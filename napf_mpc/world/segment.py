@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.world.distance import (
     BASE,
     CYLINDER,
@@ -60,7 +60,7 @@ def segment_distance(
     return _prism(solids, i, start, stop, length, cap)
 
 
-@compiled
+@compiled_bare
 def _to_point(
     start: NDArray[np.float64], stop: NDArray[np.float64], x: float, y: float, z: float, vertical: float
 ) -> float:
@@ -81,7 +81,7 @@ def _to_point(
     return length3(wx + t * vx, wy + t * vy, wz + t * vz)
 
 
-@compiled
+@compiled_bare
 def _wall(
     solids: Solids, i: int, v: int, w: int, px: float, py: float, pz: float
 ) -> tuple[float, float, float, float]:
@@ -100,7 +100,7 @@ def _wall(
     return d, x / d, y / d, z / d
 
 
-@compiled
+@compiled_bare
 def _probe(
     solids: Solids,
     i: int,
@@ -268,7 +268,7 @@ def _inner_bound(
     return bound
 
 
-@compiled
+@compiled_bare
 def _edge(solids: Solids, v: int, w: int, px: float, py: float) -> float:
     """Distance in the plane to the edge between vertices v and w."""
     ax = solids.vertices[v, 0] - px

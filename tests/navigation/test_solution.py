@@ -69,6 +69,16 @@ def test_a_covariance_without_spread_in_one_direction_is_trusted():
     assert solution(covariance=covariance).trusted().all()
 
 
+def test_a_matrix_that_is_not_symmetric_is_no_covariance():
+    covariance = np.tile(np.eye(6), (RUNS, UAVS, 1, 1))
+    covariance[..., 0, 1] = covariance[..., 1, 0] = 0.5
+    covariance[0, 1, 0, 1] = 0.4
+    covariance[1, 0, 0, 1] += 1e-9  # rounding
+    trusted = solution(covariance=covariance).trusted()
+    assert not trusted[0, 1]
+    assert trusted.sum() == RUNS * UAVS - 1
+
+
 def test_velocity_may_be_error_free():
     """Zero velocity variance is what a model with true velocities reports; only position is inflated."""
     assert (solution().covariance[..., 3:, 3:] == 0.0).all()

@@ -361,6 +361,21 @@ def test_a_run_does_not_depend_on_its_block() -> None:
         np.testing.assert_array_equal(together[name][mine], column, err_msg=name)
 
 
+def test_a_run_that_has_landed_is_not_planned_for_and_changes_nothing_for_others() -> None:
+    block = Guidance(problem(), Inflation(3.0), SETTINGS)
+    alone = guidance([Sphere((30.0, 3.0, 0.0), 2.0)])
+    block.reset(ObstacleSet.from_shapes([Sphere((30.0, 3.0, 0.0), 2.0)]), 2)
+    place, trusted = np.stack([advanced(8.0)] * 2), np.ones((2, 4), dtype=bool)
+    flying = np.array([False, True])
+    for step in range(3):
+        both = block.step(place, isotropic(0.5, 2), trusted, float(step), flying=flying)
+        mine = alone.step(place[1:], isotropic(0.5), trusted[1:], float(step))
+        np.testing.assert_array_equal(both.offset[1:], mine.offset)
+        np.testing.assert_array_equal(both.pace[1:], mine.pace)
+        assert np.abs(both.offset[1]).max() > 1.0, "the one that flies goes round"
+        assert np.abs(both.offset[0]).max() == 0.0, "the one that has landed is left as it was"
+
+
 def test_degenerate_starts_are_planned_with_finite_numbers() -> None:
     """On the axis of a cylinder, at the centre of a sphere, all UAVs in one place, far off the lattice."""
     made = guidance([Cylinder((10.0, 3.0), 1.5), Sphere((10.0, -3.0, 0.0), 1.0)])

@@ -409,6 +409,39 @@ def test_masked_runs_are_skipped_whatever_they_hold() -> None:
         make_batch_solver("kernel").solve_batch(horizon, WarmStart(np.zeros((2, 2, 3)), np.zeros((2, 2, 3))))
 
 
+def test_steady_rows_are_read_again_when_they_are_others() -> None:
+    near, far = (replace(wall(x_m, 500.0, 10.0), steady=True) for x_m in (2.0, 5.0))
+    changing, other = wall(7.0, 500.0, 10.0), wall(1.0, 500.0, 10.0)
+    solver, model = make_batch_solver("kernel"), hover_model()
+    for rows in ((near, changing), (near, other), (far, other), (far, changing), (near, changing)):
+        horizon = one(*rows, model=model)
+        answer, fresh = solver.solve_batch(horizon), certified(horizon)
+        np.testing.assert_array_equal(answer.states, fresh.states)
+        most = min(float(block.upper[0, 0, 0, 0]) for block in rows if block.upper is not None)
+        assert answer.states[..., 0].max() == pytest.approx(most, abs=1e-6)
+
+
+def test_steady_rows_serve_programs_of_every_chunk_and_bad_ones_fail_all() -> None:
+    horizon = mixed(5, 12, 3)
+    rows = tuple(
+        replace(block, **{name: np.broadcast_to(values[:1, :1], values.shape).copy()
+                          for name in ("jac", "lower", "upper", "w1", "w2")
+                          if (values := getattr(block, name)) is not None})
+        for block in horizon.rows
+    )  # fmt: skip
+    solver = make_batch_solver("kernel")
+    plain = solver.solve_batch(replace(horizon, rows=rows))
+    steady = replace(horizon, rows=tuple(replace(block, steady=True) for block in rows))
+    for _ in range(2):
+        np.testing.assert_array_equal(solver.solve_batch(steady).z, plain.z)
+    spoilt = rows[0].jac.copy()
+    spoilt[:, :, 0] = np.nan
+    bad = (replace(rows[0], jac=spoilt, steady=True), *steady.rows[1:])
+    answer = solver.solve_batch(replace(horizon, rows=bad))
+    assert (answer.status == STATUSES.index(QpStatus.FAILED)).all()
+    np.testing.assert_array_equal(solver.solve_batch(steady).z, plain.z)
+
+
 def test_empty_batch() -> None:
     result = make_batch_solver("kernel").solve_batch(mixed(0, 0, 2))
     assert result.states.shape == (0, 2, len(GRID), 12)

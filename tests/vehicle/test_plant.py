@@ -68,7 +68,7 @@ def test_what_the_generator_writes_now_is_the_casadi_model():
     source = codegen.generate()
     assert source == codegen.generate()
     assert "python -m napf_mpc.vehicle.codegen" in source
-    plain_python = source.replace("@compiled\n", "")
+    plain_python = source.replace("@compiled_bare\n", "")
     exec(compile(plain_python, "generated", "exec"), namespace)  # our own text, not input
     assert worst_relative_error(namespace["derivative"]) <= 1e-13
 
@@ -102,7 +102,7 @@ def test_every_operation_of_the_generator_means_what_casadi_means():
     ]
     function = ca.Function("every", [x, u, p], [ca.vertcat(*terms, ca.SX(0.125))])
     namespace: dict[str, object] = {}
-    exec(compile(codegen.generate(function).replace("@compiled\n", ""), "generated", "exec"), namespace)
+    exec(compile(codegen.generate(function).replace("@compiled_bare\n", ""), "generated", "exec"), namespace)
     state, out = np.array([0.7, 2.3, *np.zeros(10)]), np.empty(14)
     namespace["derivative"](state, np.zeros(4), np.zeros(4), out)
     np.testing.assert_allclose(out, np.array(function(state, 0, 0)).ravel(), rtol=1e-15)

@@ -1,0 +1,154 @@
+"""Reader of NMEA 0183 logs: positions from GGA sentences, their reported covariance from GST.
+
+GGA and GST tell the time of day only. The date comes from ZDA or RMC sentences; without any, times count from
+the first midnight and the time system is called ``UTC, no date``.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.errors import DataError
+from napf_mpc.navigation.readers.track import GPS_EPOCH_UNIX_S, checked_track, open_size, unix_seconds
+from napf_mpc.navigation.rtklib import PosTrack, numbered_lines
+from napf_mpc.words import shown_text
+
+__all__ = ["read_nmea"]
+
+Array = NDArray[np.float64]
+
+DAY_S = 86_400.0
+_SENTENCE = re.compile(r"\$[A-Z]{2}(GGA|GST|ZDA|RMC),")
+
+
+def read_nmea(path: Path) -> PosTrack:
+    r"""Read GGA and GST sentences of an NMEA 0183 log.
+
+    The horizontal covariance is that of GST's error ellipse, whose semi-major axis :math:`\sigma_1` lies
+    ``orient`` degrees clockwise from north, :math:`\sigma_2` across: with unit vectors u and v along them,
+    :math:`\sigma_1^2 u u^T + \sigma_2^2 v v^T`. A receiver that leaves the ellipse empty has its latitude and
+    longitude sigmas taken. Height is that above sea level plus the geoid's separation.
+
+    Parameters
+    ----------
+    path : Path
+        Text file, one sentence a line, with checksums. Other sentences are passed over.
+
+    Returns
+    -------
+    PosTrack
+        Epochs whose GGA says that there is a fix; without a GST of the same time, of zero covariance, as a
+        truth has it. The time system is ``UTC``.
+
+    Raises
+    ------
+    DataError
+        The file is missing, empty, no such log, or a sentence in it is broken (file and line are named).
+    """
+    open_size(path)
+    clock = _Clock()
+    fixes: list[tuple[float, list[float]]] = []
+    reports: dict[float, Array] = {}
+    for number, line in numbered_lines(path):
+        if not line.startswith(("$", "!")):
+            raise DataError(f"{path}, line {number}: {shown_text(line)} is no NMEA sentence ($...*hh)")
+        kind = _SENTENCE.match(line)
+        if kind is None:
+            continue
+        place = f"{path}, line {number}"
+        message = _parsed(place, line)
+        if kind[1] in ("ZDA", "RMC"):
+            clock.date(message)
+            continue
+        if not isinstance(message.time, dt.time):
+            continue  # before its first fix a receiver knows no time
+        time_s = clock.count(message.time)
+        if kind[1] == "GST":
+            reports[time_s] = _covariance(place, message)
+        elif message.quality != 0:
+            values = (message.lat, message.lon, message.alt)
+            separation = message.sep if message.sep != "" else 0.0
+            if "" in values:
+                raise DataError(f"{place}: GGA claims a fix but leaves its position empty")
+            fixes.append((time_s, [float(values[0]), float(values[1]), float(values[2]) + float(separation)]))
+    times = [clock.offset_s + time_s for time_s, _ in fixes]
+    unknown = np.zeros((3, 3))
+    covariances = [reports.get(time_s, unknown) for time_s, _ in fixes]
+    return checked_track(path, clock.system, times, [position for _, position in fixes], covariances)
+
+
+def _parsed(place: str, line: str) -> Any:
+    try:
+        import pynmeagps
+    except ImportError as error:
+        raise DataError(
+            f"{place}: reading NMEA needs the package pynmeagps; install napf-mpc[receivers]"
+        ) from error
+    if not re.search(r"\*[0-9A-Fa-f]{2}$", line):
+        raise DataError(f"{place}: sentence is cut off (no checksum at its end): {shown_text(line)}")
+    try:
+        return pynmeagps.NMEAReader.parse(line.encode() + b"\r\n", validate=pynmeagps.VALCKSUM)
+    except Exception as error:  # a parser given anything may raise anything
+        raise DataError(f"{place}: broken sentence ({shown_text(str(error), 120)})") from error
+
+
+class _Clock:
+    """Turns times of day into seconds that go on over midnight."""
+
+    def __init__(self) -> None:
+        self.days = 0
+        self.last_s = -1.0
+        self.offset_s = 0.0
+        self.system = "UTC, no date"
+
+    def count(self, time: dt.time) -> float:
+        """Seconds since the first midnight; a step back of more than half a day is a new day."""
+        second = time.hour * 3600.0 + time.minute * 60.0 + time.second + 1e-6 * time.microsecond
+        if second < self.last_s - DAY_S / 2:
+            self.days += 1
+        self.last_s = second
+        return self.days * DAY_S + second
+
+    def date(self, message: Any) -> None:
+        """Learn the date of the first midnight, once."""
+        if self.system == "UTC" or not isinstance(message.time, dt.time):
+            return
+        if message.msgID == "ZDA":
+            day = message.year, message.month, message.day
+        elif isinstance(message.date, dt.date):
+            day = message.date.year, message.date.month, message.date.day
+        else:
+            return
+        if not all(isinstance(part, int) for part in day) or day[0] < 1980:
+            return
+        self.count(message.time)
+        self.offset_s = unix_seconds(*day) - GPS_EPOCH_UNIX_S - self.days * DAY_S
+        self.system = "UTC"
+
+
+def _covariance(place: str, gst: Any) -> Array:
+    """East, north, up covariance [m^2] of a GST sentence; zero where it leaves its sigmas empty."""
+    out = np.zeros((3, 3))
+    ellipse = (gst.stdMajor, gst.stdMinor, gst.orient)
+    axes = (gst.stdLat, gst.stdLong, gst.stdAlt)
+    if "" in axes:
+        return out
+    north, east, up = (float(value) for value in axes)
+    if min(north, east, up) < 0.0:
+        raise DataError(f"{place}: GST has a negative sigma; it must be >= 0")
+    if "" in ellipse:
+        out[0, 0], out[1, 1] = east**2, north**2
+    else:
+        major, minor, bearing = float(ellipse[0]), float(ellipse[1]), math.radians(float(ellipse[2]))
+        along = np.array([math.sin(bearing), math.cos(bearing)])
+        across = np.array([math.cos(bearing), -math.sin(bearing)])
+        out[:2, :2] = major**2 * np.outer(along, along) + minor**2 * np.outer(across, across)
+    out[2, 2] = up**2
+    return out

@@ -1,0 +1,165 @@
+"""Reader of RINEX 3 navigation files: broadcast ephemerides of GPS, Galileo and QZSS."""
+
+from __future__ import annotations
+
+import datetime as dt
+import math
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from napf_mpc.errors import DataError
+from napf_mpc.navigation.ephemeris import SYSTEMS, Ephemerides
+from napf_mpc.words import shown_text
+
+__all__ = ["gps_seconds", "read_rinex_navigation"]
+
+MAX_RECORDS = 200_000
+MAX_BYTES = 100_000_000
+_LETTERS = {"G": "GPS", "E": "Galileo", "J": "QZSS"}
+_LINES = 8
+_GPS_EPOCH = dt.datetime(1980, 1, 6)
+_INAV = 0b101  # bits of Galileo's "data sources": I/NAV of E1-B, I/NAV of E5b-I
+
+# Place of each number in a record: 3 in the first line, 4 in each of the others.
+_PLACES = {
+    "af0": 0, "af1": 1, "af2": 2, "crs": 4, "delta_n": 5, "m0": 6, "cuc": 7, "e": 8, "cus": 9, "sqrt_a": 10,
+    "toe": 11, "cic": 12, "omega0": 13, "cis": 14, "i0": 15, "crc": 16, "omega": 17, "omega_dot": 18,
+    "idot": 19, "source": 20, "week": 21, "accuracy_m": 23, "health": 24,
+}  # fmt: skip
+_LIMITS = {"e": (0.0, 0.5), "sqrt_a": (2000.0, 8000.0), "toe": (0.0, 604_800.0), "week": (0.0, 10_000.0)}
+
+
+def gps_seconds(moment: dt.datetime) -> float:
+    """Seconds of GPS time since 1980-01-06 00:00, of a date that is in GPS time."""
+    return (moment - _GPS_EPOCH).total_seconds()
+
+
+def read_rinex_navigation(path: Path) -> Ephemerides:
+    """Read the GPS, Galileo (I/NAV) and QZSS records of a navigation file; others are passed over.
+
+    A file that was read before and has not changed since is not read again.
+
+    Parameters
+    ----------
+    path : Path
+        RINEX 3 navigation file, mixed or of one system.
+
+    Returns
+    -------
+    Ephemerides
+        In the order of the file, without repeated records.
+
+    Raises
+    ------
+    DataError
+        The file is missing, not such a file, holds no record of these systems, or a record that is cut short
+        or has a number that is missing or out of range (file and line are named).
+    """
+    try:
+        stat = path.stat()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
+    return _read_cached(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=4)
+def _read_cached(path: Path, _changed_ns: int, size: int) -> Ephemerides:
+    if size > MAX_BYTES:
+        raise DataError(f"{path}: {size} bytes, at most {MAX_BYTES} are read")
+    try:
+        text = path.read_text(encoding="ascii")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a text file ({error.reason})") from error
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
+    lines = enumerate(text.splitlines(), start=1)
+    _check_header(path, next(lines, (0, ""))[1])
+    in_header = True
+    records: dict[tuple[str, float], tuple[str, dict[str, float], float]] = {}
+    block: list[str] = []
+    start = 0
+
+    def close() -> None:
+        if not block or block[0][0] not in _LETTERS:
+            return
+        name, values, toc = _record(f"{path}, line {start}", block)
+        if block[0][0] != "E" or int(values["source"]) & _INAV:
+            records.setdefault((name, values["week"] * 604_800.0 + values["toe"]), (name, values, toc))
+        if len(records) > MAX_RECORDS:
+            raise DataError(f"{path}: more than {MAX_RECORDS} records")
+
+    for number, line in lines:
+        if in_header:
+            in_header = line[60:].strip() != "END OF HEADER"
+            continue
+        if line[:1].isalpha():
+            close()
+            block, start = [line], number
+        elif line.strip() and block:
+            block.append(line)
+        elif line.strip():
+            raise DataError(f"{path}, line {number}: {shown_text(line)} belongs to no record")
+    if in_header:
+        raise DataError(f'{path}: has no line "END OF HEADER"; not a RINEX 3 navigation file')
+    close()
+    if not records:
+        raise DataError(f"{path}: holds no ephemeris of {', '.join(SYSTEMS[:-1])} or {SYSTEMS[-1]}")
+    return _table(list(records.values()))
+
+
+def _check_header(path: Path, line: str) -> None:
+    if line[60:].strip() != "RINEX VERSION / TYPE" or line[20:21] != "N":
+        raise DataError(f"{path}, line 1: {shown_text(line)} is not the head of a RINEX navigation file")
+    if not line[:20].strip().startswith("3."):
+        raise DataError(
+            f"{path}, line 1: RINEX version {shown_text(line[:20].strip())}, must be 3; convert the file"
+        )
+
+
+def _record(place: str, lines: list[str]) -> tuple[str, dict[str, float], float]:
+    """Name, numbers and reference time of the clock of one record."""
+    if len(lines) < _LINES:
+        raise DataError(f"{place}: a record of {len(lines)} lines, must have {_LINES}")
+    head = lines[0]
+    texts = [head[23 + 19 * k : 42 + 19 * k] for k in range(3)]
+    texts += [line[4 + 19 * k : 23 + 19 * k] for line in lines[1:_LINES] for k in range(4)]
+    values = {}
+    for key, at in _PLACES.items():
+        if key == "source" and head[0] != "E":
+            continue  # a spare or another thing there
+        values[key] = _number(place, key, texts[at])
+    try:
+        epoch = dt.datetime(*(int(field) for field in head[3:23].split()))  # type: ignore[arg-type]
+    except (ValueError, TypeError):
+        raise DataError(f"{place}: {shown_text(head[3:23])} is not a date and time") from None
+    name = head[0] + head[1:3].replace(" ", "0")
+    return name, values, gps_seconds(epoch)
+
+
+def _number(place: str, key: str, text: str) -> float:
+    try:
+        value = float(text.replace("D", "E").replace("d", "E"))
+    except ValueError:
+        raise DataError(f"{place}: {key} is {shown_text(text.strip()) or 'missing'}, not a number") from None
+    low, high = _LIMITS.get(key, (-math.inf, math.inf))
+    if not (math.isfinite(value) and low <= value <= high):
+        words = f", must be from {low:g} to {high:g}" if key in _LIMITS else ", must be finite"
+        raise DataError(f"{place}: {key} = {value:g}{words}")
+    return value
+
+
+def _table(records: list[tuple[str, dict[str, float], float]]) -> Ephemerides:
+    def column(key: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        return np.array([values[key] for _, values, _ in records])
+
+    names = np.array([name for name, _, _ in records])
+    return Ephemerides(
+        name=names,
+        system=np.array([SYSTEMS.index(_LETTERS[name[0]]) for name in names], dtype=np.int64),
+        toc_s=np.array([toc for _, _, toc in records]),
+        toe_s=column("week") * 604_800.0 + column("toe"),
+        healthy=column("health") == 0.0,
+        **{key: column(key) for key in _PLACES if key not in ("toe", "source", "week", "health")},
+    )
