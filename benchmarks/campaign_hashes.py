@@ -15,11 +15,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from campaign_soak import short_problem
 from campaign_torture import digest
 
 from napf_mpc import store
 from napf_mpc.campaign import run_campaign, versions
-from napf_mpc.problem_file import load_problem
 from napf_mpc.provenance import processor
 
 BLOCKS = (1, 7, 64)
@@ -35,11 +35,10 @@ def shared_runs(a: Path, b: Path) -> int:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--problem", default="table1_8")
     parser.add_argument("--planners", nargs="+", default=["apf", "napf", "qp"])
     parser.add_argument("--runs", type=int, default=120)
     asked = parser.parse_args(arguments)
-    problem = load_problem(asked.problem)
+    problem = short_problem()
     half = asked.runs // 2
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hashes-")))
@@ -71,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return out
 
         print(f"{processor()}, {', '.join(f'{k} {v}' for k, v in versions().items())}")
-        print(f"{asked.problem}, {', '.join(asked.planners)}, {asked.runs} runs, seed 7")
+        print(f"table1_8, its first two seconds, {', '.join(asked.planners)}, {asked.runs} runs, seed 7")
         hashes = []
         for engine in engines:
             for block in BLOCKS:
