@@ -175,7 +175,9 @@ class Torture:
                 tally.slowest_s = max(tally.slowest_s, took_s)
                 tally.late += took_s > STOP_S
                 told = re.fullmatch(r"stopped(: \d+ of \d+ runs are kept .*)?\n", words)
-                early = not words and process.returncode in (-signum, 1)  # while Python itself was starting
+                # While Python was starting: our handlers, once there, raise no KeyboardInterrupt.
+                own_end = not words or words.endswith("KeyboardInterrupt\n")
+                early = own_end and process.returncode in (-signum, 1)
                 self._expect(tally, early or (process.returncode == 128 + signum and bool(told)), words)
         self._finish(out, tally)
         return tally
