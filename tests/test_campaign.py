@@ -68,6 +68,18 @@ def test_blocks_of_one_change_no_bit(tmp_path: Path) -> None:
     assert fly(tmp_path / "a", 9, block_runs=1) == fly(tmp_path / "b", 9, block_runs=9)
 
 
+def test_events_come_by_run_then_time_whatever_the_blocks(tmp_path: Path) -> None:
+    watched = {"filter": "kalman", "monitor": "innovations", "reported_sigma_scale": 0.2}
+    problem = brief(**{f"navigation.{key}": value for key, value in watched.items()})
+    for block_runs in (1, 4):
+        fly(tmp_path / str(block_runs), 4, problem=problem, planners=["napf"], block_runs=block_runs)
+    single, together = (store.read_table(tmp_path / name / "events.parquet") for name in ("1", "4"))
+    assert len(set(together["run"])) == 4  # all have alarms, so that there is an order to speak of
+    for name, values in single.items():
+        np.testing.assert_array_equal(values, together[name], err_msg=name)
+    assert (np.diff(together["run"] * 1e6 + together["t_s"]) >= 0.0).all()
+
+
 def test_the_first_runs_are_those_of_a_shorter_campaign(hundred: Path, tmp_path: Path) -> None:
     fly(tmp_path, 50)
     short, long = store.read_table(tmp_path / "runs.parquet"), store.read_table(hundred / "runs.parquet")

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from napf_mpc.navigation import cross_covariance, kalman
 from napf_mpc.navigation.fix import is_symmetric
 from napf_mpc.navigation.forecast import CovarianceForecast, ForecastModel, drifts
-from napf_mpc.navigation.monitor import InnovationMonitor, MonitorEvent, squared_innovations
+from napf_mpc.navigation.monitor import InnovationMonitor, squared_innovations
 from napf_mpc.navigation.sensors import bias_memory
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import ConstantBias, GaussMarkov, Gnss, Navigation, Recorded
@@ -196,11 +196,6 @@ class KalmanFilter:
     def monitor(self) -> InnovationMonitor | None:
         """What watches the innovations; None if nothing does."""
         return self._monitor
-
-    @property
-    def events(self) -> list[MonitorEvent]:
-        """Alarms of the monitor so far."""
-        return [] if self._monitor is None else self._monitor.events
 
     def predict(self, velocity_change: Array, active: Mask) -> None:
         """Carry the estimates over a tick.

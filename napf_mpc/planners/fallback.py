@@ -19,8 +19,8 @@ DESCEND_AFTER_S = 30.0
 """Hovering without an accepted plan for this long ends in a descent [s]."""
 DESCENT_MPS = 0.5
 """Speed of that descent [m/s]."""
-MOST_EVENTS = 10_000
-"""Events of a block that are kept one by one; all uses are counted."""
+MOST_EVENTS = 1_000
+"""Events of a run that are kept one by one; all uses are counted."""
 
 
 class Action(IntEnum):
@@ -48,6 +48,7 @@ class Ladder:
     def __init__(self, runs: int, uavs: int) -> None:
         self.events: list[Event] = []
         """Every time that a UAV takes to an action other than a new plan."""
+        self._kept = np.zeros(runs, dtype=np.int64)
         self._hovering_since: Array = np.full((runs, uavs), np.nan)
         self._last: Codes = np.zeros((runs, uavs), dtype=np.int8)
 
@@ -89,7 +90,8 @@ class Ladder:
         action[hover & (time_s - self._hovering_since >= DESCEND_AFTER_S)] = Action.DESCEND
         changed = (action != self._last) & (action != Action.PLAN) & (causes != "")
         for run, uav in np.argwhere(changed).tolist():
-            if len(self.events) < MOST_EVENTS:
+            if self._kept[run] < MOST_EVENTS:  # of a run, whatever else flies with it
+                self._kept[run] += 1
                 taken = Action(int(action[run, uav]))
                 self.events.append(Event(time_s, run, uav, str(causes[run, uav]), taken.name.lower()))
         self._last = action

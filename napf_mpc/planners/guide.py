@@ -87,14 +87,6 @@ class Guide:
         out = low + part[..., None] * (high - low)
         return np.asarray(out[:, :, 0] if np.ndim(ahead_m) == 0 else out)
 
-    def slope_at(self, ahead_m: Array) -> Array:
-        """Offset per metre flown (run, uav, N, 2) at distances ahead (run, uav, N); 0 past the last place."""
-        index, _ = self._place(ahead_m)
-        low = np.take_along_axis(self.offset, index[..., None], axis=2)
-        high = np.take_along_axis(self.offset, index[..., None] + 1, axis=2)
-        inside = (ahead_m >= 0.0) & (ahead_m < self.ahead_m[-1])
-        return np.asarray(np.where(inside[..., None], (high - low) / self._spacing, 0.0))
-
     def slope(self, from_m: float, to_m: float) -> Array:
         """Mean slope (run, uav, 2) of the offset between two distances ahead."""
         return np.asarray((self.at(to_m) - self.at(from_m)) / (to_m - from_m))

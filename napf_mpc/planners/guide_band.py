@@ -48,18 +48,6 @@ class Band(NamedTuple):
     lower: Array  # (station, 4) scratch: the factor's blocks below them, row by row
 
 
-def empty_band(stations: int) -> Band:
-    """System of zeros."""
-    return Band(
-        np.zeros((stations, 3)),
-        np.zeros(stations),
-        np.zeros(stations),
-        np.zeros((stations, 2)),
-        np.zeros((stations, 3)),
-        np.zeros((stations, 4)),
-    )
-
-
 @compiled_bare
 def solve_band(band: Band) -> None:
     """Solve a band system in place, by the block LDL^T factors."""

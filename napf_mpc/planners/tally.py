@@ -65,8 +65,8 @@ class Tally:
         return {**self.counts, "largest_slack_m": self.largest_slack_m}
 
     def event_columns(self, planner: str, first_run: int) -> dict[str, NDArray[Any]]:
-        """Columns of ``events.parquet``."""
-        events = self.events
+        """Columns of ``events.parquet``, by run, then time, whatever runs fly together."""
+        events = sorted(self.events, key=lambda event: (event.run, event.time_s))
         return {
             "planner": np.full(len(events), planner, dtype=f"<U{max(1, len(planner))}"),
             "run": np.array([first_run + event.run for event in events], dtype=np.int64),

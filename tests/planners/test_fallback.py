@@ -64,3 +64,12 @@ def test_events_do_not_fill_the_memory() -> None:
     for tick in range(2 * MOST_EVENTS + 2):
         decide(ladder, tick * 0.1, tick % 2 == 0, 0.0, True)
     assert len(ladder.events) == MOST_EVENTS
+
+
+def test_a_run_with_many_events_takes_none_from_another() -> None:
+    ladder = Ladder(2, 1)
+    age, clear, cause = np.zeros((2, 1)), np.ones((2, 1), dtype=bool), np.full((2, 1), "dual", dtype=object)
+    for tick in range(2 * MOST_EVENTS + 2):
+        late = tick > 2 * MOST_EVENTS and tick % 2 == 1
+        ladder.decide(tick * 0.1, np.array([[tick % 2 == 0], [not late]]), age, clear, cause)
+    assert [event.run for event in ladder.events].count(1) == 1

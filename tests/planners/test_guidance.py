@@ -14,7 +14,7 @@ from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guidance import Guidance
 from napf_mpc.planners.guide import Guide, Passage
-from napf_mpc.planners.guide_band import empty_band, solve_band
+from napf_mpc.planners.guide_band import Band, solve_band
 from napf_mpc.planners.guide_settings import GuidanceSettings
 from napf_mpc.planners.guided_field import GuidedNapfPlanner
 from napf_mpc.planners.registry import make_planner
@@ -423,7 +423,7 @@ def test_the_band_solver_solves() -> None:
     """Blocks of two, the station before and the one before that, against a dense solution."""
     rng = np.random.default_rng(3)
     stations = 14
-    band = empty_band(stations)
+    band = Band(*(np.zeros((stations, *width)) for width in ((3,), (), (), (2,), (3,), (4,))))
     band.own[:] = rng.uniform(0.5, 1.0, (stations, 3)) + np.array([10.0, 10.0, 0.0])
     band.one[1:] = rng.normal(size=stations - 1)
     band.two[2:] = rng.normal(size=stations - 2)
