@@ -1,6 +1,6 @@
 """Write the key tables of docs/problem_files.md from the problem model, so that they cannot differ from it.
 
-Run ``python docs/make_problem_reference.py`` after a change to ``napf_mpc/problem.py``. What stands above the
+Run ``python docs/make_problem_reference.py`` after a change to ``napf_mpc/problem/``. What stands above the
 mark in the file is written by hand and kept.
 """
 
