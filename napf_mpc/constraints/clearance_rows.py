@@ -185,7 +185,6 @@ def influence_rows(
                     for axis in range(3):
                         total += normal[run, uav, k, j, axis] * position[run, uav, k, axis]
                     free = price <= 0.0
-                    off = free or not abs(rho) < np.inf
-                    lower[run, uav, k, j] = -np.inf if off else total + (target - rho)
+                    lower[run, uav, k, j] = -np.inf if free else total + (target - rho)
                     # A slack without a price would be undetermined; this one's row is switched off.
                     w2[run, uav, k, j] = 1.0 if free else price

@@ -145,7 +145,8 @@ def check_constraint(
 
     Its rows fit the horizon and are finite, bounds infinite where there is none; the signal, the number of
     rows and the kind of slack are the same for every horizon; the same question gets the same answer, to the
-    last bit, whatever else is in the batch, and leaves the horizon as it was.
+    last bit, whatever else is in the batch, and leaves the horizon as it was. Rows that are called steady are
+    those of every UAV, and nobody writes into them.
 
     Parameters
     ----------
@@ -165,6 +166,7 @@ def check_constraint(
     if not (isinstance(constraint.name, str) and constraint.name):
         faults.append("name must be a text that is not empty")
     kinds: dict[tuple[object, ...], int] = {}
+    steady: list[tuple[int, LinearRows, list[Array]]] = []
     for i, horizon in enumerate(sample_horizons() if horizons is None else horizons):
         horizon.check()
         before = [values.copy() for values in _arrays(horizon)]
@@ -176,8 +178,13 @@ def check_constraint(
         except ConstraintError as error:
             faults.append(f"horizon {i}: {error}")
             continue
+        if rows.steady:
+            steady.append((i, rows, [values.copy() for values in _values(rows)]))
         kinds.setdefault(_kind(rows), i)
         faults += [f"horizon {i}: {fault}" for fault in _faults(constraint, horizon, rows, couples_uavs)]
+    for i, rows, then in steady:
+        if any(not np.array_equal(a, b) for a, b in zip(then, _values(rows), strict=True)):
+            faults.append(f"horizon {i}: steady rows were written into later")
     if len(kinds) > 1:
         listed = "; ".join(f"{kind} at horizon {i}" for kind, i in kinds.items())
         faults.append(f"(signal, rows, bounds, slack) must never change, got {listed}")
@@ -190,6 +197,10 @@ def _arrays(horizon: Horizon) -> list[Array]:
     seen = [] if tracks is None else [tracks.position, tracks.velocity, tracks.covariance, tracks.radius]
     plans = [horizon.step_s, horizon.position, horizon.velocity, horizon.covariance, horizon.common_factor]
     return plans + seen
+
+
+def _values(rows: LinearRows) -> list[Array]:
+    return [values for values in (rows.jac, rows.lower, rows.upper, rows.w1, rows.w2) if values is not None]
 
 
 def _kind(rows: LinearRows) -> tuple[object, ...]:
@@ -206,6 +217,8 @@ def _faults(constraint: Constraint, horizon: Horizon, rows: LinearRows, couples_
     for name, bound in (("lower", rows.lower), ("upper", rows.upper)):
         if bound is not None and (np.isfinite(bound) & (np.abs(bound) > LARGEST_BOUND)).any():
             yield f"{name} holds a number beyond {LARGEST_BOUND:g}; use an infinite bound for none"
+    if rows.steady and any((values != values[:1, :1]).any() for values in _values(rows)):
+        yield "steady rows differ between runs or UAVs; leave steady out"
     if not _same(rows, constraint.rows(horizon)):
         yield "asked twice, the rows differ: rows() must not remember anything"
     runs, uavs, _ = horizon.shape

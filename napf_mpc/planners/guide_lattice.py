@@ -132,10 +132,9 @@ class Bench(NamedTuple):
     own: Array  # (layer, cell) places' own prices without what is in the way
     bend: Array  # (layer, cell) squared offsets, bent
     ahead: Array  # (station,) least price of what follows, per squared offset [1/m^2]
-    spans: NDArray[
-        np.int64
-    ]  # (2, layer and one on each side, 2) first and last place of each row that can be
-    # got to, at even and odd stations
+    # (2, layer and one on each side, 2) first and last place of each row that can be got to, at even and odd
+    # stations.
+    spans: NDArray[np.int64]
 
 
 @compiled_bare

@@ -82,6 +82,24 @@ def remembers() -> Callable[[Horizon], LinearRows]:
     return rows
 
 
+def steady_for_one(horizon: Horizon) -> LinearRows:
+    rows = ceiling(horizon)
+    assert rows.upper is not None
+    rows.upper[:, -1] += 1.0
+    return replace(rows, steady=True)
+
+
+def steady_and_written() -> Callable[[Horizon], LinearRows]:
+    kept = np.full((3, 4, 6, 1), 50.0)
+
+    def rows(horizon: Horizon) -> LinearRows:
+        run, uav, _ = horizon.shape
+        kept[...] = 50.0 + horizon.time_s
+        return replace(ceiling(horizon), upper=kept[:run, :uav], steady=True)
+
+    return rows
+
+
 @pytest.mark.parametrize(
     ("make", "fault"),
     [
@@ -93,6 +111,8 @@ def remembers() -> Callable[[Horizon], LinearRows]:
         (sees_the_other_uavs, "UAV 0 alone"),
         (meddles, "changed the horizon"),
         (remembers(), "must not remember"),
+        (steady_for_one, "steady rows differ between runs or UAVs"),
+        (steady_and_written(), "steady rows were written into"),
     ],
     ids=lambda part: getattr(part, "__name__", None),
 )
