@@ -8,8 +8,9 @@ times are a quarter of the step's (the UAV's share); how often that share, and t
 one thread, take longer than the period is counted apart.
 Further rows are of a single UAV, which has no neighbour rows and shares the step's fixed cost with nobody.
 
-cvxpy (one program with parameters, compiled once) and do-mpc are shown the first UAV of ten steps one after
-the other in every hundred, see other_controllers.py; the planner's own query and rows are in their times.
+cvxpy (one program with parameters, compiled once), CVXPYgen (the same as generated C) and do-mpc are shown
+the first UAV of ten steps one after the other in every hundred, see other_controllers.py; the planner's own
+query and rows are in their times.
 Each is left out, by name, where it is not installed. "Refused" are answers that the planner did not fly, or
 that these do not call solved; "thrust off" says how far their first thrust is from the one that is flown.
 """
@@ -27,7 +28,7 @@ from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
-from other_controllers import CvxpyController, DoMpcController
+from other_controllers import CvxpyController, CvxpygenController, DoMpcController
 from plant_speed import machine
 from threadpoolctl import threadpool_limits
 
@@ -262,6 +263,7 @@ def others_installed(problem: Problem) -> list[OtherWay]:
     a, b = discretize(*linearize(problem.vehicle), step_s)
     makers: tuple[tuple[str, str, Callable[[HorizonQp], CvxpyController | DoMpcController]], ...] = (
         ("cvxpy", CvxpyController.name, CvxpyController),
+        ("cvxpygen", CvxpygenController.name, CvxpygenController),
         ("do_mpc", DoMpcController.name, lambda horizon: DoMpcController(horizon, a, b, step_s)),
     )
     found = []
@@ -293,7 +295,7 @@ def line(scene: str, way: Way, off: list[float] | None = None) -> str:
 def versions() -> str:
     """Packages that matter here."""
     words = [f"python {platform.python_version()}"]
-    for name in ("numpy", "numba", "osqp", "cvxpy", "casadi", "do-mpc"):
+    for name in ("numpy", "numba", "osqp", "cvxpy", "cvxpygen", "casadi", "do-mpc"):
         try:
             words.append(f"{name} {version(name)}")
         except PackageNotFoundError:

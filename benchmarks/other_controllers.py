@@ -1,14 +1,19 @@
-"""The program of one UAV in the hands of two general tools, for benchmarks: cvxpy and do-mpc.
+"""The program of one UAV in the hands of general tools, for benchmarks: cvxpy, CVXPYgen and do-mpc.
 
-Both are made once for a horizon's shapes and solve new numbers at each step, as their manuals advise (cvxpy
-by its parameters). cvxpy is given the very program of the planner. do-mpc knows one length of stage only: its
-program has the size and the kinds of rows of the planner's, on a grid of even stages, with linear prices of
-slacks only, and is solved by IPOPT as any of its programs.
+All are made once for a horizon's shapes and solve new numbers at each step, as their manuals advise (cvxpy
+by its parameters, CVXPYgen by C code that it generates for the same parameters and compiles). These two are
+given the very program of the planner. do-mpc knows one length of stage only: its program has the size and the
+kinds of rows of the planner's, on a grid of even stages, with linear prices of slacks only, and is solved by
+IPOPT as any of its programs.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
+import sys
 from importlib import import_module
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -20,6 +25,7 @@ from napf_mpc.qp import INPUTS, STATES, HorizonQp
 
 Array = NDArray[np.float64]
 
+OSQP_SETTINGS: dict[str, Any] = {"eps_abs": 1e-4, "eps_rel": 1e-5, "polishing": True}
 FAR = 1e4
 """Stands for a bound that is not there: both tools refuse an infinite parameter."""
 
@@ -121,11 +127,44 @@ class CvxpyController:
                     parameter.value = finite(values[at]).ravel()
             if stiffness is not None and block.w2 is not None:
                 stiffness.value = np.sqrt(block.w2[at] * self._steps[:, None]).ravel()
-        self._problem.solve(
-            solver="OSQP", warm_start=True, eps_abs=1e-4, eps_rel=1e-5, polishing=True, max_iter=20000
-        )
-        self.solved = self._problem.status == self._cp.OPTIMAL
+        self._optimise()
+        # CVXPYgen says it in OSQP's words.
+        self.solved = self._problem.status in (self._cp.OPTIMAL, "solved")
         return np.asarray(self._u.value[:INPUTS], dtype=float)
+
+    def _optimise(self) -> None:
+        """Solve the program for the parameters as they stand."""
+        self._problem.solve(solver="OSQP", warm_start=True, max_iter=20000, **OSQP_SETTINGS)
+
+
+class CvxpygenController(CvxpyController):
+    """The same program as C code with OSQP inside, generated and compiled once: a minute, and a C compiler.
+
+    Parameters
+    ----------
+    horizon : HorizonQp
+        Shapes, model and rows that do not change.
+    """
+
+    name = "CVXPYgen, OSQP"
+
+    def __init__(self, horizon: HorizonQp) -> None:
+        super().__init__(horizon)
+        cpg: Any = import_module("cvxpygen.cpg")
+        self._folder = TemporaryDirectory()
+        sys.path.insert(0, self._folder.name)
+        try:
+            # It imports what it has compiled, by the name of the folder, and registers it as "CPG".
+            with contextlib.chdir(self._folder.name), contextlib.redirect_stdout(io.StringIO()):
+                cpg.generate_code(
+                    self._problem, code_dir=f"generated_{id(self)}", solver="OSQP",
+                    solver_opts={"max_iter": 20000}, enable_settings=["polishing"],
+                )  # fmt: skip
+        finally:
+            sys.path.remove(self._folder.name)
+
+    def _optimise(self) -> None:
+        self._problem.solve(method="CPG", **OSQP_SETTINGS)
 
 
 class DoMpcController:
