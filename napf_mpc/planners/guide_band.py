@@ -29,7 +29,7 @@ from napf_mpc.planners.guide_clearance import (
     round_shortfall,
     shortfall,
 )
-from napf_mpc.planners.guide_lattice import Prices, bent, missing_price, steep, steep_limit
+from napf_mpc.planners.guide_prices import Prices, bent, missing_price, steep, steep_limit
 
 Array = NDArray[np.float64]
 

@@ -34,20 +34,9 @@ from napf_mpc.planners.guide_clearance import (
     look,
     vertical_room,
 )
-from napf_mpc.planners.guide_lattice import (
-    HALO,
-    LAYER_HALO,
-    Bench,
-    Lattice,
-    Prices,
-    Query,
-    any_short,
-    bend_offsets,
-    cheapest_profile,
-    cover,
-    list_here,
-    price_ahead,
-)
+from napf_mpc.planners.guide_lattice import Lattice, any_short, cover, list_here
+from napf_mpc.planners.guide_prices import Prices, Query, bend_offsets, price_ahead
+from napf_mpc.planners.guide_profile import HALO, LAYER_HALO, Bench, cheapest_profile
 from napf_mpc.world.distance import Solids
 
 Array = NDArray[np.float64]

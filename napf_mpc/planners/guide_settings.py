@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from napf_mpc.constraints.passage import PassageMargins
-from napf_mpc.planners.guide_lattice import Lattice, Prices
+from napf_mpc.planners.guide_lattice import Lattice
+from napf_mpc.planners.guide_prices import Prices
 from napf_mpc.planners.guide_search import Search
 
 FINE = 2

@@ -18,20 +18,18 @@ from napf_mpc.planners.guide_clearance import (
     shortfall,
     solid_boxes,
 )
-from napf_mpc.planners.guide_lattice import (
-    Bench,
+from napf_mpc.planners.guide_lattice import cover, list_here
+from napf_mpc.planners.guide_prices import (
     Prices,
     Query,
     bend_offsets,
     bent,
-    cheapest_profile,
-    cover,
-    list_here,
     missing_price,
     price_ahead,
     steep,
     steep_limit,
 )
+from napf_mpc.planners.guide_profile import Bench, cheapest_profile
 from napf_mpc.planners.guide_search import make_scratch
 from napf_mpc.planners.guide_settings import GuidanceSettings, search_of
 from napf_mpc.world.obstacles import ObstacleSet
