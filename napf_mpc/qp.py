@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -67,7 +68,7 @@ class HorizonModel:
         """Number of stages N."""
         return len(self.step_s)
 
-    @property
+    @cached_property
     def times_s(self) -> Array:
         """(N,) time from now at the end of each stage [s]."""
         return np.cumsum(self.step_s)

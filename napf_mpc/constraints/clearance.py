@@ -29,7 +29,7 @@ from napf_mpc.constraints.clearance_rows import (
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.constraints.passage import margins_beside, passage_margins
 from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins, sigma_along
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.vehicle.plant import plain
 from napf_mpc.world.distance import CYLINDER, SPHERE, A
@@ -89,11 +89,12 @@ class Gaps:
         """
         runs, uavs, stages = horizon.shape
         radius, rho_0 = horizon.problem.vehicle.radius_m, horizon.problem.planner.influence_m
-        reach = reach_m + radius + inflation.largest_margin(horizon.covariance)
+        reach = np.empty((runs, uavs * stages))
+        _reaches(plain(horizon.covariance), reach_m + radius, inflation.k * math.sqrt(3.0), reach.reshape(-1))
         # An obstacle a little farther off may act more where the error is larger in its direction.
         near = horizon.obstacles.near(
             horizon.position.reshape(runs, uavs * stages, 3),
-            reach.reshape(runs, uavs * stages),
+            reach,
             2 * count,
             together=stages,
         )
@@ -105,7 +106,8 @@ class Gaps:
         else:
             size = (_exact if margin == "exact" else _passage)(horizon, index, normal, inflation)
         kept = (runs, uavs, stages, count)
-        gaps = cls(np.empty(kept), np.empty((*kept, 3)), *[np.empty(kept) for _ in range(4)])
+        distance, *rest = np.empty((5, *kept))
+        gaps = cls(distance, np.empty((*kept, 3)), *rest)
         _choose(
             near.distance.reshape(points, 2 * count),
             near.gradient.reshape(points, 2 * count, 3),
@@ -124,6 +126,19 @@ class Gaps:
             gaps.influence.reshape(points, count),
         )
         return gaps
+
+
+@compiled_bare
+def _reaches(covariance: Array, reach_m: float, sigmas: float, reach: Array) -> None:
+    """Write a reach plus so many root mean square sigmas, of covariances (run, uav, N, 3, 3) in a row."""
+    at = 0
+    for run in range(covariance.shape[0]):
+        for uav in range(covariance.shape[1]):
+            for k in range(covariance.shape[2]):
+                c = covariance[run, uav, k]
+                trace = c[0, 0] + c[1, 1] + c[2, 2]
+                reach[at] = reach_m + sigmas * math.sqrt(max(trace, 0.0) / 3.0)
+                at += 1
 
 
 @compiled
@@ -375,7 +390,7 @@ class ObstacleContact(_Shell):
         opening = math.inf if self.opening_mps is None else self.opening_mps
         contact_rows(
             gaps.normal, gaps.shifted, gaps.sigma, plain(horizon.position), *self._extra(), opening,
-            np.cumsum(horizon.step_s), lower,
+            horizon.times_s, lower,
         )  # fmt: skip
         slack = (*horizon.shape, 1)
         return LinearRows(

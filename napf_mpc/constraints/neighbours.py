@@ -10,8 +10,9 @@ from the centre is d_n. Two UAVs that keep ``n^T (p_i - p_j) >= d_n + k sqrt(n^T
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +126,7 @@ class NeighbourSeparation:
     """Linear price of a slack [1/(m s)]."""
     w2: float = SEPARATION_W2
     """Quadratic price of a slack [1/(m^2 s)]."""
+    _kept: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.neighbours < 1 or not self.stretch >= 1.0 or not 0.5 <= self.share <= 1.0:
@@ -158,16 +160,24 @@ class NeighbourSeparation:
             inflation.k,
             _distance(self.distance_m, horizon.problem),
             self.stretch,
-            _aside(uavs, horizon.frame),
-            self._most_by_slots(horizon),
+            *self._pairs(horizon),
             np.inf if self.opening_mps is None else self.opening_mps,
-            np.cumsum(horizon.step_s),
+            horizon.times_s,
             self.share,
             self.reach_m,
             jac,
             lower,
         )
         return LinearRows("position", jac, lower, None, np.full(shape, self.w1), np.full(shape, self.w2))
+
+    def _pairs(self, horizon: Horizon) -> tuple[Array, Array]:
+        """Where to part, and most that is asked, of each pair; the same as long as problem and frame are."""
+        known, problem, frame, uavs = self._kept, horizon.problem, horizon.frame, horizon.shape[1]
+        if not (known and known[0] is problem and known[1] is frame and len(known[2]) == uavs):
+            known[:] = [problem, frame, _aside(uavs, frame), self._most_by_slots(horizon)]
+        aside: Array = known[2]
+        most: Array = known[3]
+        return aside, most
 
     def _even_margin(self, horizon: Horizon, inflation: Inflation) -> Array:
         """Margins (run, N, uav, neighbour) by readings that ask for the same in all directions [m]."""

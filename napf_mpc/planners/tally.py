@@ -58,7 +58,12 @@ class Tally:
     @classmethod
     def none(cls, runs: int) -> Tally:
         """Tally of a planner that solves nothing."""
-        return cls({name: np.zeros(runs, dtype=np.int64) for name in COLUMNS}, np.full(runs, np.nan))
+        return cls.over(np.zeros((len(COLUMNS), runs), dtype=np.int64))
+
+    @classmethod
+    def over(cls, counts: NDArray[np.int64]) -> Tally:
+        """Tally of counts (column, run) in the order of :data:`COLUMNS`: the same memory."""
+        return cls(dict(zip(COLUMNS, counts, strict=True)), np.full(counts.shape[1], np.nan))
 
     def columns(self) -> dict[str, NDArray[np.int64] | Array]:
         """Columns of ``runs.parquet``."""

@@ -119,9 +119,12 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
         inside,
     )
     finite = np.ones(result.status.shape, dtype=np.bool_)
-    for values in (result.states, result.inputs, *result.slacks):
-        if values.size:
-            _all_finite(values, finite)
+    parts = [result.states, result.inputs, *result.slacks]
+    apart = [values for values in parts if values.size and not _is_part(values, result.z)]
+    if len(apart) < len(parts):
+        apart.append(result.z[..., None])
+    for values in apart:
+        _all_finite(values, finite)
     balanced = np.empty(result.status.shape, dtype=np.bool_)
     first = result.states.shape[-2] * STATES
     _balanced(plain(result.y), first, plain(result.complementarity), limits.complementarity, balanced)
@@ -131,6 +134,11 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
         limits.dual, why,
     )  # fmt: skip
     return why
+
+
+def _is_part(values: Array, whole: Array) -> bool:
+    """Whether an array is a view of another, or both of the same."""
+    return values.base is whole or (whole.base is not None and values.base is whole.base)
 
 
 # Codes as plain numbers, for the compiled loop.

@@ -315,6 +315,10 @@ def _finite(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
 
 
 def _spread(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    if isinstance(values, np.ndarray) and values.shape == shape and values.dtype == np.float64:
+        spread = np.ascontiguousarray(values)
+        if not np.isnan(spread).any():
+            return spread
     try:
         array = np.ascontiguousarray(np.broadcast_to(np.asarray(values, dtype=np.float64), shape))
     except ValueError:
