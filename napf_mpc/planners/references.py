@@ -91,12 +91,14 @@ class SlotReference:
 
     def here(self, position: Array, sigma_m: Array | float = 0.0) -> Here:
         """Where references start; parameters are those of :meth:`over`."""
-        place = self.frame.to_path(position)
+        position, place = plain(position), self.frame.to_path(position)
         ahead = synchronisation_error(place[..., 0], self.offsets[:, 0])
-        sigma = plain(np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), place.shape))
-        behind = np.empty(ahead.shape)
+        sigma = np.asarray(sigma_m, dtype=np.float64)
+        if sigma.shape != place.shape:
+            sigma = np.broadcast_to(sigma, place.shape)
+        sigma, behind = plain(sigma), np.empty(ahead.shape)
         _believe(ahead, sigma, behind)
-        return Here(plain(position), place, sigma, behind)
+        return Here(position, place, sigma, behind)
 
     def over_from(self, here: Here, times_s: Array, guide: Guide | None = None) -> Array:
         """States to track (run, uav, N, 12), as :meth:`over` makes them."""

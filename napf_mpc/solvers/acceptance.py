@@ -112,11 +112,7 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
     """
     inside = np.empty(result.status.shape, dtype=np.bool_)
     _inputs_inside(
-        result.inputs,
-        limits.input_matrix,
-        limits.input_lower - INPUT_TOLERANCE_N,
-        limits.input_upper + INPUT_TOLERANCE_N,
-        inside,
+        result.inputs, limits.input_matrix, limits.input_lower, limits.input_upper, INPUT_TOLERANCE_N, inside
     )
     finite = np.ones(result.status.shape, dtype=np.bool_)
     parts = [result.states, result.inputs, *result.slacks]
@@ -173,8 +169,10 @@ def _judge(
 
 
 @compiled_bare
-def _inputs_inside(inputs: Array, matrix: Array, lower: Array, upper: Array, inside: Mask) -> None:
-    """Write whether all inputs (run, uav, N, 4) keep rows between bounds; NaN does not."""
+def _inputs_inside(
+    inputs: Array, matrix: Array, lower: Array, upper: Array, tolerance: float, inside: Mask
+) -> None:
+    """Write whether all inputs (run, uav, N, 4) keep rows within a tolerance of bounds; NaN does not."""
     for run in range(inputs.shape[0]):
         for uav in range(inputs.shape[1]):
             keeps = True
@@ -183,7 +181,7 @@ def _inputs_inside(inputs: Array, matrix: Array, lower: Array, upper: Array, ins
                     value = 0.0
                     for axis in range(inputs.shape[3]):
                         value += matrix[i, axis] * inputs[run, uav, k, axis]
-                    keeps = keeps and lower[i] <= value <= upper[i]
+                    keeps = keeps and lower[i] - tolerance <= value <= upper[i] + tolerance
             inside[run, uav] = keeps
 
 

@@ -20,7 +20,7 @@ from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, Worki
 from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, Kept, Room, solve_programs
 from napf_mpc.solvers.kernel_rows import RowPlaces, RowTable, gather
 from napf_mpc.solvers.kernel_signals import SignalMaps, signal_maps
-from napf_mpc.solvers.kernel_sweep import Lanes
+from napf_mpc.solvers.kernel_sweep import LANES, Lanes
 
 CHUNK = 16
 """Programs solved side by side: enough to share the model's entries, few enough to stay in the cache."""
@@ -54,6 +54,8 @@ class _Home:
     kept: Kept
     lanes: dict[int, Lanes]
     """By their number."""
+    single: Lanes
+    """For programs that are solved alone."""
     steady: dict[int, LinearRows]
     """Blocks that stand in the table for all programs, by their place in the horizon."""
     outlines: list[Hashable]
@@ -74,7 +76,7 @@ class _Home:
         return cls(
             horizon.model, layout, maps, RowPlaces.of(layout, maps.place), tuple(first),
             RowTable.empty(CHUNK, families, shelves, n), work, Room.empty(n, soft, len(work.row)),
-            Kept.empty(CHUNK, soft, len(work.row)), {1: Lanes.empty(n, 1)}, {}, [],
+            Kept.empty(CHUNK, soft, len(work.row)), {}, Lanes.empty(n, 1), {}, [],
         )  # fmt: skip
 
     def seen(self, horizon: HorizonQp) -> bool:
@@ -96,6 +98,7 @@ class _Home:
 
     def lanes_for(self, count: int) -> Lanes:
         """Room for so many programs side by side."""
+        count += -count % LANES
         if count not in self.lanes:
             self.lanes[count] = Lanes.empty(self.layout.stages, count)
         return self.lanes[count]
@@ -182,7 +185,7 @@ class KernelSolver:
             raise QpError(f"active has shape {asked.shape}, must be ({runs},)")
         guesses = checked_guess(warm, (runs, uavs, n), (runs, uavs, m))
         z, y = np.zeros((batch, n)), np.zeros((batch, m))
-        residuals, ends, steps = np.full((batch, 3), np.inf), np.full(batch, -1), np.full(batch, -1)
+        residuals, ends, steps = np.full((3, batch), np.inf), np.full(batch, -1), np.full(batch, -1)
         initial = _plain(horizon.initial).reshape(batch, STATES)
         reference = _plain(horizon.reference).reshape(batch, stages, STATES)
         guess = (z, y)
@@ -198,7 +201,7 @@ class KernelSolver:
                 gather(home.table, programs, family, shelf, step_s, *arrays)
             solve_programs(
                 home.maps, home.places, home.table, programs, home.work, home.room, home.kept,
-                home.lanes_for(len(programs)), home.lanes[1], initial, reference,
+                home.lanes_for(len(programs)), home.single, initial, reference,
                 guesses is not None, *guess, self._limit, z, y, residuals, ends, steps,
             )  # fmt: skip
         return _result(horizon, layout, z, y, residuals, ends, steps)
@@ -232,7 +235,7 @@ def _result(
                 why_unusable(layout, horizon, run, uav) if ends[i] == UNUSABLE else _MESSAGES[ends[i]]
             )
     z, y = z.reshape(runs, uavs, z.shape[1]), y.reshape(runs, uavs, y.shape[1])
-    primal, dual, complementarity = residuals.T.reshape(3, runs, uavs)
+    primal, dual, complementarity = residuals.reshape(3, runs, uavs)
     return BatchResult(
         _CODES[ends].reshape(runs, uavs), layout.states(z), layout.inputs(z), layout.block_slacks(z),
         z, y, primal, dual, complementarity, steps.reshape(runs, uavs), messages,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from napf_mpc.vehicle.derivative_generated import derivative
 from napf_mpc.vehicle.quadrotor import INPUTS, PARAMETERS, STATES
 
 Array = NDArray[np.float64]
+_DOUBLE = np.dtype(np.float64)
 
 
 def advance(
@@ -67,8 +69,8 @@ def advance(
 
 def plain(array: NDArray[np.generic]) -> Array:
     """Return the array as writeable C-contiguous float64, a copy only if it is not: one compiled variant."""
-    if array.dtype == np.float64 and array.flags.c_contiguous and array.flags.writeable:
-        return array.astype(np.float64, copy=False)
+    if array.flags.carray and array.dtype == _DOUBLE:
+        return cast(Array, array)
     return np.array(array, dtype=np.float64, order="C")
 
 
