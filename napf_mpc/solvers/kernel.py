@@ -20,7 +20,7 @@ from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, Worki
 from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, Kept, Room, solve_programs
 from napf_mpc.solvers.kernel_rows import RowPlaces, RowTable, gather
 from napf_mpc.solvers.kernel_signals import SignalMaps, signal_maps
-from napf_mpc.solvers.kernel_sweep import LANES, Lanes
+from napf_mpc.solvers.kernel_sweep import Lanes
 
 CHUNK = 16
 """Programs solved side by side: enough to share the model's entries, few enough to stay in the cache."""
@@ -98,7 +98,6 @@ class _Home:
 
     def lanes_for(self, count: int) -> Lanes:
         """Room for so many programs side by side."""
-        count += -count % LANES
         if count not in self.lanes:
             self.lanes[count] = Lanes.empty(self.layout.stages, count)
         return self.lanes[count]
@@ -185,7 +184,7 @@ class KernelSolver:
             raise QpError(f"active has shape {asked.shape}, must be ({runs},)")
         guesses = checked_guess(warm, (runs, uavs, n), (runs, uavs, m))
         z, y = np.zeros((batch, n)), np.zeros((batch, m))
-        residuals, ends, steps = np.full((3, batch), np.inf), np.full(batch, -1), np.full(batch, -1)
+        residuals, ends, steps = np.full((batch, 3), np.inf), np.full(batch, -1), np.full(batch, -1)
         initial = _plain(horizon.initial).reshape(batch, STATES)
         reference = _plain(horizon.reference).reshape(batch, stages, STATES)
         guess = (z, y)
@@ -235,7 +234,7 @@ def _result(
                 why_unusable(layout, horizon, run, uav) if ends[i] == UNUSABLE else _MESSAGES[ends[i]]
             )
     z, y = z.reshape(runs, uavs, z.shape[1]), y.reshape(runs, uavs, y.shape[1])
-    primal, dual, complementarity = residuals.reshape(3, runs, uavs)
+    primal, dual, complementarity = residuals.T.reshape(3, runs, uavs)
     return BatchResult(
         _CODES[ends].reshape(runs, uavs), layout.states(z), layout.inputs(z), layout.block_slacks(z),
         z, y, primal, dual, complementarity, steps.reshape(runs, uavs), messages,

@@ -461,7 +461,7 @@ def solve_programs(
     programs : array of int, shape (programs of the table,)
         Their places in the batch.
     work, room, kept, lanes, single : WorkingSet, Room, Kept and two Lanes
-        Room to work in; lanes for all programs, and for one.
+        Room to work in; lanes are as many as programs, and a single one.
     initial, reference : array, shapes (batch, 12) and (batch, N, 12)
         As in :class:`~napf_mpc.qp.HorizonQp`.
     warm : bool
@@ -472,7 +472,7 @@ def solve_programs(
         Steps of a program at most.
     z, y : array, shapes (batch, n) and (batch, m)
         Where answers go.
-    residuals : array, shape (3, batch)
+    residuals : array, shape (batch, 3)
         Primal, dual, complementarity.
     ends, steps : array of int, shape (batch,)
         How each program ended, and after how many steps.
@@ -513,7 +513,7 @@ def solve_programs(
             steps[i] = kept.steps[u]
         if end in (OPTIMAL, ROUGH):
             for e in range(3):
-                residuals[e, i] = room.certificate[2 * e]
+                residuals[i, e] = room.certificate[2 * e]
         else:
             for e in range(z.shape[1]):
                 z[i, e] = np.nan

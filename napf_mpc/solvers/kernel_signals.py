@@ -27,9 +27,8 @@ TARGETS = np.array(
 """(13,) place of each signal in the state, or 12 and its place in the input."""
 FIRST = np.cumsum([0, *(len(SIGNALS[kind]) for kind in KINDS)])[:-1]
 """(4,) number of the first signal of each kind."""
-A, B, Q, R, GAIN, PULL, INVERSE, TO_GO, A_TURNED, B_TURNED, CLOSED_TURNED, GAIN_TURNED = range(12)
-"""Matrices of a stage: the model's; K, H^-1 B' and H^-1; the optimal cost from its end on; and transposes of
-A, B, A - B K and K."""
+A, B, Q, R, CLOSED, GAIN, PULL, INVERSE, TO_GO = range(9)
+"""Matrices of a stage: the model's; A - B K, K, H^-1 B' and H^-1; the optimal cost from its end on."""
 NOISE = 1e-14
 """Entries of a weight below this part of what its diagonal allows are rounding."""
 LOOSE = 1e-13
@@ -46,11 +45,9 @@ class SignalMaps(NamedTuple):
     """A model as the compiled loops need it: matrices as lists of their entries, and the signal kernel."""
 
     begins: Index
-    """(12, N + 1) where the lines of each matrix and stage begin, see :data:`A` to :data:`GAIN_TURNED`."""
+    """(9, N + 1) where the entries of each matrix and stage begin, see :data:`A` to :data:`TO_GO`."""
     row: Small
-    """(lines,) row of each line that is not empty."""
-    entry: Small
-    """(lines + 1,) where its entries begin."""
+    """(entries,)."""
     column: Small
     """(entries,)."""
     value: Array
@@ -106,8 +103,7 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
     at = (order[:, None] * n + np.arange(n)).ravel()
     chain_of = np.repeat(chain[order], n)
     pull = inverse @ model.b.transpose(t)
-    turned = (model.a.transpose(t), model.b.transpose(t), closed.transpose(t), gain.transpose(t))
-    matrices = (model.a, model.b, model.q, model.r, gain, pull, inverse, to_go, *turned)
+    matrices = (model.a, model.b, model.q, model.r, closed, gain, pull, inverse, to_go)
     return SignalMaps(
         *_entries(matrices),
         np.ascontiguousarray(kernel[np.ix_(at, at)]),
@@ -126,26 +122,20 @@ def _cleaned(weight: Array) -> Array:
     return np.where(np.abs(weight) <= NOISE * size[:, None] * size, 0.0, weight)
 
 
-def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Small, Small, Small, Array]:
-    """Where the lines of each matrix and stage begin; rows of the lines; columns and values of the entries.
-
-    Only what is not zero counts: lines with entries, and those entries.
-    """
+def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Small, Small, Array]:
+    """Where each matrix and stage begins; row, column and value of all entries that are not zero."""
     stages = len(matrices[0])
     begins = np.empty((len(matrices), stages + 1), dtype=np.int64)
-    rows, sizes, columns, values, count = [], [], [], [], 0
+    rows, columns, values, count = [], [], [], 0
     for which, matrix in enumerate(matrices):
         stage, row, column = np.nonzero(matrix)
-        lines, size = np.unique(stage * matrix.shape[1] + row, return_counts=True)
-        begins[which] = count + np.searchsorted(lines // matrix.shape[1], np.arange(stages + 1))
-        rows.append(lines % matrix.shape[1])
-        sizes.append(size)
+        begins[which] = count + np.searchsorted(stage, np.arange(stages + 1))
+        rows.append(row)
         columns.append(column)
         values.append(matrix[stage, row, column])
-        count += len(lines)
-    entry = np.append(0, np.cumsum(np.concatenate(sizes)))
-    places = [np.ascontiguousarray(v, dtype=np.uint32) for v in (np.concatenate(rows), entry)]
-    return begins, *places, np.concatenate(columns).astype(np.uint32), np.concatenate(values)
+        count += len(stage)
+    places = [np.concatenate(v).astype(np.uint32) for v in (rows, columns)]
+    return begins, places[0], places[1], np.concatenate(values)
 
 
 def _inverse_root(hessian: Array, stage: int) -> Array:

@@ -13,24 +13,7 @@ import numpy as np
 
 from napf_mpc.jit import compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
-from napf_mpc.solvers.kernel_signals import (
-    A_TURNED,
-    B_TURNED,
-    CLOSED_TURNED,
-    GAIN,
-    GAIN_TURNED,
-    INVERSE,
-    PULL,
-    TO_GO,
-    A,
-    B,
-    Q,
-    R,
-    SignalMaps,
-)
-
-LANES = 4
-"""Lanes come in multiples of these; one that no program is in holds whatever is left there."""
+from napf_mpc.solvers.kernel_signals import CLOSED, GAIN, INVERSE, PULL, TO_GO, A, B, Q, R, SignalMaps
 
 
 class Lanes(NamedTuple):
@@ -67,8 +50,7 @@ class Lanes(NamedTuple):
 
     @classmethod
     def empty(cls, stages: int, count: int) -> Lanes:
-        """Room for at least so many programs."""
-        count += -count % LANES
+        """Room for so many programs."""
         state, push = (stages, STATES, count), (stages, INPUTS, count)
         both = (stages, STATES + INPUTS, count)
         return cls(
@@ -84,22 +66,23 @@ def add(
 ) -> None:
     """Add ``sign matrix vector[at]`` of a matrix of stage k to ``out[to, first:]``.
 
-    Arrays come whole with indices: views of them cost more than the sums. Four lanes at a time are summed up
-    outside of memory, where sums need not wait for each other.
+    Arrays come whole with indices: views of them cost more than the sums.
     """
-    for line in range(maps.begins[which, k], maps.begins[which, k + 1]):
-        row = first + maps.row[line]
-        for lane in range(0, out.shape[2], LANES):
-            a, b = out[to, row, lane], out[to, row, lane + 1]
-            c, d = out[to, row, lane + 2], out[to, row, lane + 3]
-            for e in range(maps.entry[line], maps.entry[line + 1]):
-                value, column = sign * maps.value[e], maps.column[e]
-                a += value * vector[at, column, lane]
-                b += value * vector[at, column, lane + 1]
-                c += value * vector[at, column, lane + 2]
-                d += value * vector[at, column, lane + 3]
-            out[to, row, lane], out[to, row, lane + 1] = a, b
-            out[to, row, lane + 2], out[to, row, lane + 3] = c, d
+    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
+        value, row, column = sign * maps.value[e], first + maps.row[e], maps.column[e]
+        for lane in range(out.shape[2]):
+            out[to, row, lane] += value * vector[at, column, lane]
+
+
+@compiled_bare
+def add_turned(
+    maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
+) -> None:
+    """The same of the matrix's transpose."""
+    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
+        value, row, column = sign * maps.value[e], first + maps.column[e], maps.row[e]
+        for lane in range(out.shape[2]):
+            out[to, row, lane] += value * vector[at, column, lane]
 
 
 @compiled_bare
@@ -148,9 +131,9 @@ def sweep(maps: SignalMaps, lanes: Lanes, loaded: bool) -> None:
             add(maps, INVERSE, k, -1.0, lanes.push, k, lanes.feed, k, 0)
         if k == 0:
             break
-        add(maps, CLOSED_TURNED, k, 1.0, lanes.cost, k, lanes.cost, k - 1, 0)
+        add_turned(maps, CLOSED, k, 1.0, lanes.cost, k, lanes.cost, k - 1, 0)
         if loaded:
-            add(maps, GAIN_TURNED, k, -1.0, lanes.push, k, lanes.cost, k - 1, 0)
+            add_turned(maps, GAIN, k, -1.0, lanes.push, k, lanes.cost, k - 1, 0)
     for k in range(n):
         for i in range(INPUTS):
             for lane in range(lanes.inputs.shape[2]):
@@ -212,9 +195,9 @@ def stationarity(maps: SignalMaps, lanes: Lanes) -> None:
         add(maps, TO_GO, k, -1.0, lanes.states, k, lanes.costates, k, 0)
         add(maps, Q, k, 1.0, lanes.states, k, lanes.weighed, k, 0)
         if k + 1 < n:
-            add(maps, A_TURNED, k + 1, 1.0, lanes.costates, k + 1, lanes.carried, k, 0)
+            add_turned(maps, A, k + 1, 1.0, lanes.costates, k + 1, lanes.carried, k, 0)
         add(maps, R, k, 1.0, lanes.inputs, k, lanes.weighed, k, STATES)
-        add(maps, B_TURNED, k, 1.0, lanes.costates, k, lanes.carried, k, STATES)
+        add_turned(maps, B, k, 1.0, lanes.costates, k, lanes.carried, k, STATES)
         for i in range(STATES + INPUTS):
             widen_bound(lanes.balance, 3, lanes.weighed, k, i)
             for lane in range(lanes.carried.shape[2]):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +69,7 @@ def advance(
 def plain(array: NDArray[np.generic]) -> Array:
     """Return the array as writeable C-contiguous float64, a copy only if it is not: one compiled variant."""
     if array.flags.carray and array.dtype == _DOUBLE:
-        return cast(Array, array)
+        return array  # type: ignore[return-value]
     return np.array(array, dtype=np.float64, order="C")
 
 
