@@ -211,13 +211,16 @@ class LinearRows:
     def shifted(self, origin: Array) -> LinearRows:
         """Return the rows for a signal measured from an origin (run, uav, dim)."""
         jac, place = plain(self.jac), plain(origin)
-        bounds: list[Array | None] = [self.lower, self.upper]
-        for n, bound in enumerate(bounds):
-            if bound is not None:
-                moved = np.empty(bound.shape)
-                _shift(jac, place, plain(bound), moved)
-                bounds[n] = moved
-        return LinearRows(self.signal, self.jac, *bounds, self.w1, self.w2, self.shared_slack)
+
+        def moved(bound: Array | None) -> Array | None:
+            if bound is None:
+                return None
+            out = np.empty(bound.shape)
+            _shift(jac, place, plain(bound), out)
+            return out
+
+        lower, upper = moved(self.lower), moved(self.upper)
+        return LinearRows(self.signal, self.jac, lower, upper, self.w1, self.w2, self.shared_slack)
 
     def check(self, shape: tuple[int, int, int]) -> None:
         """Refuse rows that do not fit a horizon of shape (run, uav, N).

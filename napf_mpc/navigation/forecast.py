@@ -185,11 +185,6 @@ def variance_ahead(
     period = drift.shape[0] - 1
     for r in range(packed.shape[0]):
         for i in range(packed.shape[1]):
-            if _same_as_before(packed, sigma, fixes, r, i):
-                for k in range(ticks.shape[0]):
-                    for a in range(3):
-                        out[r, i, k, a] = out[r, i - 1, k, a] if i > 0 else out[r - 1, -1, k, a]
-                continue
             for a in range(3):
                 for e in range(kalman.PACKED):
                     c[a, e] = packed[r, i, a, e]
@@ -217,20 +212,6 @@ def variance_ahead(
                         to_new = epochs_per_new
                 for a in range(3):
                     out[r, i, k, a] = c[a, 0]
-
-
-@compiled_bare
-def _same_as_before(packed: Array, sigma: Array, fixes: Mask, r: int, i: int) -> bool:
-    """Whether all that a forecast depends on is, bit by bit, that of the UAV before, as it often is."""
-    if r == 0 and i == 0:
-        return False
-    q, j = (r, i - 1) if i > 0 else (r - 1, packed.shape[1] - 1)
-    same = fixes[r, i] == fixes[q, j]
-    for a in range(3):
-        same = same and sigma[r, i, a] == sigma[q, j, a]
-        for e in range(kalman.PACKED):
-            same = same and packed[r, i, a, e] == packed[q, j, a, e]
-    return same
 
 
 @compiled_bare

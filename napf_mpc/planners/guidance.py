@@ -50,8 +50,9 @@ def guidance_covariance(nav: NavSolution, trusted: NDArray[np.bool_], ahead: Arr
     """
     room = nav.position_covariance
     if ahead is not None and nav.forecast is not None:
-        room = np.where(nav.forecast.fixes[..., None, None], ahead, room)
-    return np.asarray(np.where(trusted[..., None, None], room, np.eye(3)))
+        fixes = nav.forecast.fixes
+        room = ahead if fixes.all() else np.where(fixes[..., None, None], ahead, room)
+    return room if trusted.all() else np.where(trusted[..., None, None], room, np.eye(3))
 
 
 class Guidance:

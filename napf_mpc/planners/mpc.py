@@ -13,7 +13,7 @@ from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, InputBox, SpeedLimit, TiltLimit
 from napf_mpc.constraints.moving import MovingObstacleContact
-from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
+from napf_mpc.constraints.neighbours import NeighbourSeparation, ShortMargins
 from napf_mpc.constraints.passage import passage_margins
 from napf_mpc.constraints.probability import sigma_along
 from napf_mpc.errors import NapfError, ProblemError
@@ -66,6 +66,7 @@ _COLUMN = np.array(
     [COLUMNS.index(f"solves_{status.value}") if status in COUNTED else -1 for status in STATUSES]
 )
 _ITERATIONS = COLUMNS.index("iterations")
+_SHORT = COLUMNS.index("margin_short")
 _NO_REASON = int(Reason.NONE)
 
 
@@ -162,9 +163,11 @@ class QpPlanner:
         self._inflation = Inflation.of_problem(problem)
         margins = passage_margins(self._inflation) if settings.margin == "passage" else None
         self._guidance = Guidance(problem, self._inflation, margins=margins) if follows else None
+        self._short = ShortMargins(problem, self._inflation) if problem.uav_count > 1 else None
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
         self._period_s = 1.0 / settings.rate_hz
         step = stage_grid(self._period_s, settings.horizon, settings.look_ahead_s)
+        self._grid = np.append(0.0, step)  # now, and the ends of the stages
         self._yaw = self._frame.heading_rad
         self._model = horizon_model(problem.vehicle, self._yaw, step, *weights(settings))
         chosen = settings.solver if solver is None else solver
@@ -245,7 +248,9 @@ class QpPlanner:
             answer.status, _COLUMN, answer.iterations, action, accepted, trusted, airborne, slack,
             _ITERATIONS, self._counts, self.tally.largest_slack_m,
         )  # fmt: skip
-        self._count_short_margins(nav, trusted)
+        if self._short is not None:
+            short = self._counts[_SHORT]
+            self._short.count(nav.position_covariance, nav.common_factor, trusted, short)
         return self._command(action, trusted, flown, guide, slack, answer)
 
     def _command(
@@ -305,9 +310,10 @@ class QpPlanner:
         """States and inputs of the last plans on this step's grid, moved to where navigation is now."""
         if self._plan is None:
             return None
-        states, inputs = self._plan.resampled(time_s, self._model.step_s)
-        passes.follow(states, state, self._plan.at(time_s)[0])
-        return states, inputs
+        states, inputs = self._plan.resampled(time_s, self._grid)
+        moved, held = np.empty((*state.shape[:2], self._model.stages, STATES)), inputs[:, :, 1:]
+        passes.follow(states, state, moved)
+        return moved, plain(held)
 
     def _references(
         self,
@@ -485,16 +491,6 @@ class QpPlanner:
         if most is None:
             return np.full(accepted.shape, np.nan)
         return most if accepted.all() else np.where(accepted, most, np.nan)
-
-    def _count_short_margins(self, nav: NavSolution, trusted: Mask) -> None:
-        """Count UAVs whose margin to some other UAV the formation itself, flown perfectly, could not keep."""
-        if len(self._lanes) > 1:
-            covariance, shared = nav.position_covariance, nav.common_factor
-            if not trusted.all():
-                known = trusted[..., None, None]
-                covariance, shared = np.where(known, covariance, 0.0), np.where(known, shared, 0.0)
-            kept = margin_attainable(self.problem, covariance, shared, inflation=self._inflation)
-            self.tally.add("margin_short", trusted & ~kept.all(-1))
 
 
 def _causes(

@@ -39,13 +39,18 @@ def report(
 
 
 @compiled_bare
-def follow(states: Array, now: Array, planned: Array) -> None:
-    """Move plans (run, uav, N, 12) from where they planned to be now (run, uav, 12) to where UAVs are."""
-    for run in range(states.shape[0]):
-        for uav in range(states.shape[1]):
-            for k in range(states.shape[2]):
+def follow(states: Array, now: Array, moved: Array) -> None:
+    """Write plans (run, uav, N, 12) moved to where UAVs are now (run, uav, 12).
+
+    The first of the states (run, uav, N + 1, 12) is where each plan meant to be now.
+    """
+    for run in range(moved.shape[0]):
+        for uav in range(moved.shape[1]):
+            for k in range(moved.shape[2]):
+                for i in range(STATES):
+                    moved[run, uav, k, i] = states[run, uav, 1 + k, i]
                 for i in range(0, 6, 2):
-                    states[run, uav, k, i] += now[run, uav, i] - planned[run, uav, i]
+                    moved[run, uav, k, i] += now[run, uav, i] - states[run, uav, 0, i]
 
 
 @compiled_bare
@@ -96,7 +101,7 @@ def take_way(
 def _along(state: Array, origin: Array, along: Array) -> float:
     """Along-track coordinate of a state (12,) [m]."""
     x, y, z = state[0] - origin[0], state[2] - origin[1], state[4] - origin[2]
-    return x * along[0] + y * along[1] + z * along[2]
+    return float(x * along[0] + y * along[1] + z * along[2])
 
 
 @compiled_bare

@@ -91,14 +91,13 @@ class SlotReference:
 
     def here(self, position: Array, sigma_m: Array | float = 0.0) -> Here:
         """Where references start; parameters are those of :meth:`over`."""
-        position, place = plain(position), self.frame.to_path(position)
-        ahead = synchronisation_error(place[..., 0], self.offsets[:, 0])
+        place, behind = self.frame.to_path(position), np.empty(position.shape[:2])
         sigma = np.asarray(sigma_m, dtype=np.float64)
         if sigma.shape != place.shape:
             sigma = np.broadcast_to(sigma, place.shape)
-        sigma, behind = plain(sigma), np.empty(ahead.shape)
-        _believe(ahead, sigma, behind)
-        return Here(position, place, sigma, behind)
+        here = Here(plain(position), place, plain(sigma), behind)
+        _believe(synchronisation_error(place[..., 0], self.offsets[:, 0]), here.sigma, behind)
+        return here
 
     def over_from(self, here: Here, times_s: Array, guide: Guide | None = None) -> Array:
         """States to track (run, uav, N, 12), as :meth:`over` makes them."""
