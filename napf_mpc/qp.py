@@ -346,10 +346,8 @@ class Layout:
 
     def block_slacks(self, z: Array) -> tuple[Array, ...]:
         """Slacks (..., N, slacks a stage) of each block of rows, of primal points (..., n)."""
-        return tuple(
-            z[..., columns].reshape(*z.shape[:-1], self.stages, kind[2])
-            for columns, kind in zip(self.slacks, self.kinds, strict=True)
-        )
+        lead, slacks = z.shape[:-1], zip(self.slacks, self.kinds, strict=True)
+        return tuple([z[..., part].reshape(*lead, self.stages, kind[2]) for part, kind in slacks])
 
 
 def _kind(block: LinearRows) -> Kind:

@@ -209,12 +209,22 @@ class LinearRows:
         return over
 
     def shifted(self, origin: Array) -> LinearRows:
-        """Return the rows for a signal measured from an origin (run, uav, dim)."""
+        """Return the rows for a signal measured from an origin (run, uav, dim).
+
+        Raises
+        ------
+        ConstraintError
+            If the origin does not fit the rows.
+        """
         jac, place = plain(self.jac), plain(origin)
+        if place.shape != (*jac.shape[:2], jac.shape[-1]):
+            raise ConstraintError(f"origin has shape {place.shape}, and the rows {jac.shape}")
 
         def moved(bound: Array | None) -> Array | None:
             if bound is None:
                 return None
+            if bound.shape != jac.shape[:-1]:
+                raise ConstraintError(f"a bound has shape {bound.shape}, and the rows {jac.shape}")
             out = np.empty(bound.shape)
             _shift(jac, place, plain(bound), out)
             return out

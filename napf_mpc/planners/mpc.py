@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -199,7 +199,7 @@ class QpPlanner:
         self.ladder = Ladder(runs, uavs)
         self._counts = np.zeros((len(COLUMNS), runs), dtype=np.int64)
         self.tally = replace(Tally.over(self._counts), events=self.ladder.events)
-        self._fits = False
+        self._outlines: list[Hashable] = []
 
     def build(self, nav: NavSolution, time_s: float) -> HorizonQp:
         """Programs of this step, in coordinates whose origin is each UAV's reported position."""
@@ -393,10 +393,11 @@ class QpPlanner:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
         origin = np.ascontiguousarray(state[..., POSITION])
         blocks: list[LinearRows] = [constraint.rows(horizon) for constraint in self.constraints]
-        if not self._fits:  # shapes never change; a solver looks at them as well, but knows no names
+        outlines = [horizon.shape, *[block.outline() for block in blocks]]
+        if outlines != self._outlines:
             for constraint, block in zip(self.constraints, blocks, strict=True):
                 block.check_shapes(horizon.shape, constraint.name)
-            self._fits = True
+            self._outlines = outlines
         blocks = [block.shifted(origin) if block.signal == "position" else block for block in blocks]
         return HorizonQp(self._model, _moved(state, -origin), _moved(reference, -origin), tuple(blocks))
 
