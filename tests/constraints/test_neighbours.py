@@ -202,13 +202,13 @@ def test_three_sigma_of_5_m_do_not_fit_into_a_square_of_10_m() -> None:
 
 @pytest.mark.parametrize("reading", ["directional", "rms", "chi2", "largest"])
 def test_short_margins_are_those_that_a_pair_of_slots_has_no_room_for(reading: Any) -> None:
-    """Sigmas of 0.3 to 3 m in a square of 10 m; a UAV without trust does not count, and takes less room."""
+    """Sigmas of 0.5 to 4.5 m in a square of 10 m; a UAV without trust does not count, and takes less room."""
     square, inflation = (
         problem(shape="square", side_m=10.0, first_lane_m=7.0),
         Inflation(3.0, reading=reading),
     )
     rng = np.random.default_rng(5)
-    axes = rng.uniform(0.3, 3.0, (40, 4, 3))
+    axes = rng.uniform(0.5, 4.5, (40, 4, 3))
     covariance, factor = axes[..., None] ** 2 * np.eye(3), 0.5 * axes[..., None] * np.eye(3)
     trusted = rng.random((40, 4)) < 0.8
     known = trusted[..., None, None]
