@@ -77,21 +77,6 @@ class Watch:
         setattr(owner, name, timed)
 
 
-class Rows:
-    """A constraint whose rows are timed."""
-
-    def __init__(self, constraint: Any, watch: Watch) -> None:
-        self.name, self._constraint = constraint.name, constraint
-        watch.on(self, "_rows", f"rows: {constraint.name}")
-
-    def _rows(self, horizon: Any) -> Any:
-        return self._constraint.rows(horizon)
-
-    def rows(self, horizon: Any) -> Any:
-        """Rows of the constraint."""
-        return self._rows(horizon)
-
-
 def main() -> None:
     """Fly, repeat and print."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -109,7 +94,8 @@ def main() -> None:
         heard = Heard(mpc.QpPlanner(problem))
         closed_loop(problem, heard, build_scenario(problem, arguments.seed, range(arguments.runs)))
         planner, watch = mpc.QpPlanner(problem), Watch()
-        planner.constraints = [Rows(constraint, watch) for constraint in planner.constraints]
+        for constraint in planner.constraints:
+            watch.on(type(constraint), "rows", f"rows: {constraint.name}")
         for phase in PHASES:
             watch.on(planner, phase, phase.strip("_").replace("_", " "))
         watch.on(planner._guidance, "step", "guidance")
