@@ -12,12 +12,14 @@ from napf_mpc.jit import compiled_bare
 from napf_mpc.planners.fallback import DESCENT_MPS, Action
 from napf_mpc.planners.planner import Reason
 from napf_mpc.qp import STATES
+from napf_mpc.solvers.acceptance import Refusal
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Codes = NDArray[np.int8]
 
 # Codes as plain numbers, for the compiled loops.
+_ACCEPTED, _PLAN = int(Refusal.NONE), int(Action.PLAN)
 _TAIL, _DESCEND = int(Action.TAIL), int(Action.DESCEND)
 _NO_REASON, _NAVIGATION, _SOLVER = int(Reason.NONE), int(Reason.NAVIGATION), int(Reason.SOLVER)
 
@@ -125,7 +127,7 @@ def accept(
         for uav in range(accepted.shape[1]):
             roll, pitch = abs(state[run, uav, 6]), abs(state[run, uav, 8])
             fallen = roll > upset_rad or pitch > upset_rad
-            flown = refused[run, uav] == 0 and trusted[run, uav] and not fallen and not late
+            flown = refused[run, uav] == _ACCEPTED and trusted[run, uav] and not fallen and not late
             upset[run, uav], accepted[run, uav] = fallen, flown
             everybody = everybody and flown
     return everybody
@@ -181,7 +183,7 @@ def count(
                     counts[where, run] += 1
                 counts[first, run] += max(iterations[run, uav], 0)
                 counts[first + 1, run] += not accepted[run, uav]
-            if airborne[run, uav] and code > 0:
+            if airborne[run, uav] and code > _PLAN:
                 counts[first + 1 + code, run] += 1
             if not slack[run, uav] <= largest[run] and slack[run, uav] == slack[run, uav]:
                 largest[run] = slack[run, uav]

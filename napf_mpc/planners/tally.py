@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from napf_mpc.quadratic_program import QpStatus
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 COUNTED = tuple(status for status in QpStatus if status is not QpStatus.SKIPPED)
 FALL_BACKS = ("tail", "hover", "descend")
@@ -80,7 +79,3 @@ class Tally:
             "cause": np.array([event.cause for event in events], dtype=np.str_),
             "action": np.array([event.action for event in events], dtype=np.str_),
         }
-
-    def add(self, name: str, uavs: Mask, amount: NDArray[np.int64] | int = 1) -> None:
-        """Count UAVs (run, uav), once each or by an amount (run, uav)."""
-        self.counts[name] += np.where(uavs, amount, 0).sum(-1)
