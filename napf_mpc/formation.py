@@ -19,6 +19,9 @@ from napf_mpc.problem import Circle, Formation, FormationMission, Line, Listed, 
 
 Array = NDArray[np.float64]
 
+FEW = 8
+"""NumPy adds up fewer numbers than these one after the other, and so can a loop, to the same last bit."""
+
 
 @dataclass(frozen=True)
 class PathFrame:
@@ -212,8 +215,25 @@ def synchronisation_error(along: Array, offsets: Array) -> Array:
     array, shape (..., uav)
         Positive for a UAV ahead of its slot [m]; their sum is zero.
     """
+    if along.ndim == 2 and along.shape[1] < FEW:
+        error = np.empty(along.shape)
+        _error(np.ascontiguousarray(along), np.ascontiguousarray(offsets), error)
+        return error
     centre = np.ascontiguousarray(along).mean(axis=-1, keepdims=True)
     return np.asarray(along - (centre + offsets))
+
+
+@compiled_bare
+def _error(along: Array, offsets: Array, error: Array) -> None:
+    """Write synchronisation errors (run, uav) of formations of fewer than :data:`FEW`."""
+    uavs = along.shape[1]
+    for run in range(along.shape[0]):
+        total = 0.0
+        for uav in range(uavs):
+            total += along[run, uav]
+        centre = total / uavs
+        for uav in range(uavs):
+            error[run, uav] = along[run, uav] - (centre + offsets[uav])
 
 
 def reference_speed(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -67,7 +68,7 @@ class HorizonModel:
         """Number of stages N."""
         return len(self.step_s)
 
-    @property
+    @cached_property
     def times_s(self) -> Array:
         """(N,) time from now at the end of each stage [s]."""
         return np.cumsum(self.step_s)
@@ -345,10 +346,8 @@ class Layout:
 
     def block_slacks(self, z: Array) -> tuple[Array, ...]:
         """Slacks (..., N, slacks a stage) of each block of rows, of primal points (..., n)."""
-        return tuple(
-            z[..., columns].reshape(*z.shape[:-1], self.stages, kind[2])
-            for columns, kind in zip(self.slacks, self.kinds, strict=True)
-        )
+        lead, slacks = z.shape[:-1], zip(self.slacks, self.kinds, strict=True)
+        return tuple([z[..., part].reshape(*lead, self.stages, kind[2]) for part, kind in slacks])
 
 
 def _kind(block: LinearRows) -> Kind:

@@ -149,6 +149,16 @@ def test_reference_speed_stays_between_its_bounds() -> None:
     )
 
 
+@pytest.mark.parametrize("uavs", [1, 2, 3, 4, 7, 8, 20])
+def test_the_error_is_that_of_numpys_mean_to_the_last_bit(uavs: int) -> None:
+    """However many fly beside each other: a block of runs must not change a run."""
+    rng = np.random.default_rng(uavs)
+    along, offsets = rng.normal(size=(50, uavs)) * 100.0, rng.normal(size=uavs)
+    wanted = along - (along.mean(-1, keepdims=True) + offsets)
+    np.testing.assert_array_equal(synchronisation_error(along, offsets), wanted)
+    np.testing.assert_array_equal(synchronisation_error(along[3], offsets), wanted[3])
+
+
 def test_in_their_slots_all_fly_at_the_reference_speed() -> None:
     """Signed offsets: the printed l2 = u_c - u_2 would make this formation fly abreast."""
     offsets = formation_offsets(Square(shape="square"))[:, 0]

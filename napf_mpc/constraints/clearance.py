@@ -32,7 +32,9 @@ from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margi
 from napf_mpc.jit import compiled
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.vehicle.plant import plain
-from napf_mpc.world.distance import CYLINDER, SPHERE, A
+from napf_mpc.world.bounding_tree import BoxTree
+from napf_mpc.world.distance import CYLINDER, SPHERE, A, Solids
+from napf_mpc.world.queries import near_all
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -89,6 +91,19 @@ class Gaps:
         """
         runs, uavs, stages = horizon.shape
         radius, rho_0 = horizon.problem.vehicle.radius_m, horizon.problem.planner.influence_m
+        kept = (runs, uavs, stages, count)
+        distance, *rest = np.empty((5, *kept))
+        gaps, shift = cls(distance, np.empty((*kept, 3)), *rest), inflation.mode == "shift"
+        if margin == "half_space" and inflation.reading in ("directional", "chi2"):
+            world = horizon.obstacles
+            place = horizon.position.reshape(runs, uavs * stages, 3)
+            _find_and_choose(
+                world.solids, world.tree, world.scene_start, plain(world.check_points("points", place)),
+                plain(horizon.covariance).reshape(-1, 3, 3), stages, reach_m + radius, radius, reach_m,
+                inflation.k * math.sqrt(3.0), inflation.k, shift, rho_0,
+                *gaps._flat(),
+            )  # fmt: skip
+            return gaps
         reach = reach_m + radius + inflation.largest_margin(horizon.covariance)
         # An obstacle a little farther off may act more where the error is larger in its direction.
         near = horizon.obstacles.near(
@@ -104,8 +119,6 @@ class Gaps:
             size = inflation.k * sigma
         else:
             size = (_exact if margin == "exact" else _passage)(horizon, index, normal, inflation)
-        kept = (runs, uavs, stages, count)
-        gaps = cls(np.empty(kept), np.empty((*kept, 3)), *[np.empty(kept) for _ in range(4)])
         _choose(
             near.distance.reshape(points, 2 * count),
             near.gradient.reshape(points, 2 * count, 3),
@@ -114,16 +127,17 @@ class Gaps:
             sigma.reshape(points, 2 * count),
             radius,
             reach_m,
-            inflation.mode == "shift",
+            shift,
             rho_0,
-            gaps.distance.reshape(points, count),
-            gaps.normal.reshape(points, count, 3),
-            gaps.margin.reshape(points, count),
-            gaps.sigma.reshape(points, count),
-            gaps.shifted.reshape(points, count),
-            gaps.influence.reshape(points, count),
+            *gaps._flat(),
         )
         return gaps
+
+    def _flat(self) -> tuple[Array, Array, Array, Array, Array, Array]:
+        """Distance, normal, margin, sigma, shifted and influence point by point: the same memory."""
+        m = self.distance.shape[-1]
+        flat = [part.reshape(-1, m) for part in (self.margin, self.sigma, self.shifted, self.influence)]
+        return self.distance.reshape(-1, m), self.normal.reshape(-1, m, 3), flat[0], flat[1], flat[2], flat[3]
 
 
 @compiled
@@ -192,6 +206,46 @@ def _choose(
             out_influence[p, j] = rho_0 if shift else rho_0 + size[p, i]
             for axis in range(3):
                 out_normal[p, j, axis] = 0.0 if none else normal[p, i, axis]
+
+
+@compiled
+def _find_and_choose(
+    solids: Solids, tree: BoxTree, scene_start: Index, points: Array, covariance: Array, together: int,
+    least_m: float, radius: float, reach_m: float, sigmas: float, k: float, shift: bool, rho_0: float,
+    out_distance: Array, out_normal: Array, out_size: Array, out_sigma: Array, out_shifted: Array,
+    out_influence: Array,
+) -> None:  # fmt: skip
+    """Find twice as many obstacles as are kept, with margins of k sigma along their normals, and choose.
+
+    An obstacle a little farther off may act more where the error is larger in its direction.
+
+    Parameters
+    ----------
+    points, covariance : array, shapes (run, point, 3) and (run x point, 3, 3)
+        Where [m], and how certain [m^2].
+    together : int
+        Points in a row that belong to one plan.
+    least_m, sigmas : float
+        Obstacles are looked for within this distance and so many root mean square sigmas.
+    """
+    runs, each, m = points.shape[0], points.shape[1], 2 * out_distance.shape[1]
+    total = runs * each
+    reach = np.empty((runs, each))
+    for p in range(total):
+        trace = covariance[p, 0, 0] + covariance[p, 1, 1] + covariance[p, 2, 2]
+        reach[p // each, p % each] = least_m + sigmas * math.sqrt(max(trace, 0.0) / 3.0)
+    distance, normal = np.empty((runs, each, m)), np.empty((runs, each, m, 3))
+    index = np.empty((runs, each, m), dtype=np.int64)
+    near_all(solids, tree, scene_start, points, reach, together, distance, normal, index)
+    flat, size, sigma = normal.reshape(total, m, 3), np.empty((total, m)), np.empty((total, m))
+    _directional(covariance, flat, sigma)
+    for p in range(total):
+        for j in range(m):
+            size[p, j] = k * sigma[p, j]
+    _choose(
+        distance.reshape(total, m), flat, index.reshape(total, m), size, sigma, radius, reach_m, shift, rho_0,
+        out_distance, out_normal, out_size, out_sigma, out_shifted, out_influence,
+    )  # fmt: skip
 
 
 def _sigma(covariance: Array, normal: Array, inflation: Inflation) -> Array:
@@ -375,7 +429,7 @@ class ObstacleContact(_Shell):
         opening = math.inf if self.opening_mps is None else self.opening_mps
         contact_rows(
             gaps.normal, gaps.shifted, gaps.sigma, plain(horizon.position), *self._extra(), opening,
-            np.cumsum(horizon.step_s), lower,
+            horizon.times_s, lower,
         )  # fmt: skip
         slack = (*horizon.shape, 1)
         return LinearRows(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.errors import NapfError
 from napf_mpc.formation import PathFrame
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.problem import Problem
 from napf_mpc.vehicle.plant import plain
@@ -68,6 +68,14 @@ class Horizon:
         """(run, uav, N)."""
         runs, uavs, stages = self.position.shape[:3]
         return runs, uavs, stages
+
+    @property
+    def times_s(self) -> Array:
+        """(N,) time from now at the end of each stage [s]."""
+        if "times_s" not in self.memo:
+            self.memo["times_s"] = np.cumsum(self.step_s)
+        times: Array = self.memo["times_s"]
+        return times
 
     def check(self) -> None:
         """Refuse a horizon whose arrays do not fit each other or are not finite.
@@ -130,6 +138,20 @@ def _along_rows(jac: Array, signal: Array, out: Array) -> None:
                     out[run, uav, k, j] = total
 
 
+@compiled_bare
+def _shift(jac: Array, origin: Array, bound: Array, moved: Array) -> None:
+    """Write bounds (run, uav, N, m) of rows for a signal measured from an origin (run, uav, dim)."""
+    runs, uavs, stages, count, dim = jac.shape
+    for run in range(runs):
+        for uav in range(uavs):
+            for k in range(stages):
+                for j in range(count):
+                    offset = 0.0
+                    for axis in range(dim):
+                        offset += jac[run, uav, k, j, axis] * origin[run, uav, axis]
+                    moved[run, uav, k, j] = bound[run, uav, k, j] - offset
+
+
 @dataclass(frozen=True, eq=False)
 class LinearRows:
     """Rows ``lower <= jac . signal <= upper`` of every run, UAV and stage, hard or soft.
@@ -187,17 +209,28 @@ class LinearRows:
         return over
 
     def shifted(self, origin: Array) -> LinearRows:
-        """Return the rows for a signal measured from an origin (run, uav, dim)."""
-        offset = self.values(origin[:, :, None])
-        return LinearRows(
-            self.signal,
-            self.jac,
-            None if self.lower is None else self.lower - offset,
-            None if self.upper is None else self.upper - offset,
-            self.w1,
-            self.w2,
-            self.shared_slack,
-        )
+        """Return the rows for a signal measured from an origin (run, uav, dim).
+
+        Raises
+        ------
+        ConstraintError
+            If the origin does not fit the rows.
+        """
+        jac, place = plain(self.jac), plain(origin)
+        if place.shape != (*jac.shape[:2], jac.shape[-1]):
+            raise ConstraintError(f"origin has shape {place.shape}, and the rows {jac.shape}")
+
+        def moved(bound: Array | None) -> Array | None:
+            if bound is None:
+                return None
+            if bound.shape != jac.shape[:-1]:
+                raise ConstraintError(f"a bound has shape {bound.shape}, and the rows {jac.shape}")
+            out = np.empty(bound.shape)
+            _shift(jac, place, plain(bound), out)
+            return out
+
+        lower, upper = moved(self.lower), moved(self.upper)
+        return LinearRows(self.signal, self.jac, lower, upper, self.w1, self.w2, self.shared_slack)
 
     def check(self, shape: tuple[int, int, int]) -> None:
         """Refuse rows that do not fit a horizon of shape (run, uav, N).
@@ -224,6 +257,16 @@ class LinearRows:
         faults = [*self._shape_faults(shape)]
         if faults:
             raise ConstraintError(f"constraint {name!r}: {'; '.join(faults)}")
+
+    def outline(self) -> Hashable:
+        """All that shapes and kind of the rows are; it never changes from step to step."""
+        return (
+            self.signal, self.shared_slack, self.jac.shape,
+            None if self.lower is None else self.lower.shape,
+            None if self.upper is None else self.upper.shape,
+            None if self.w1 is None else self.w1.shape,
+            None if self.w2 is None else self.w2.shape,
+        )  # fmt: skip
 
     def _shape_faults(self, shape: tuple[int, int, int]) -> Iterator[str]:
         if self.signal not in SIGNALS:

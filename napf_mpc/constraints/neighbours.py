@@ -10,8 +10,9 @@ from the centre is d_n. Two UAVs that keep ``n^T (p_i - p_j) >= d_n + k sqrt(n^T
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +126,7 @@ class NeighbourSeparation:
     """Linear price of a slack [1/(m s)]."""
     w2: float = SEPARATION_W2
     """Quadratic price of a slack [1/(m^2 s)]."""
+    _kept: list[Any] = field(default_factory=list, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.neighbours < 1 or not self.stretch >= 1.0 or not 0.5 <= self.share <= 1.0:
@@ -158,16 +160,24 @@ class NeighbourSeparation:
             inflation.k,
             _distance(self.distance_m, horizon.problem),
             self.stretch,
-            _aside(uavs, horizon.frame),
-            self._most_by_slots(horizon),
+            *self._pairs(horizon),
             np.inf if self.opening_mps is None else self.opening_mps,
-            np.cumsum(horizon.step_s),
+            horizon.times_s,
             self.share,
             self.reach_m,
             jac,
             lower,
         )
         return LinearRows("position", jac, lower, None, np.full(shape, self.w1), np.full(shape, self.w2))
+
+    def _pairs(self, horizon: Horizon) -> tuple[Array, Array]:
+        """Where to part, and most that is asked, of each pair; the same as long as problem and frame are."""
+        known, problem, frame, uavs = self._kept, horizon.problem, horizon.frame, horizon.shape[1]
+        if not (known and known[0] is problem and known[1] is frame and len(known[2]) == uavs):
+            known[:] = [problem, frame, _aside(uavs, frame), self._most_by_slots(horizon)]
+        aside: Array = known[2]
+        most: Array = known[3]
+        return aside, most
 
     def _even_margin(self, horizon: Horizon, inflation: Inflation) -> Array:
         """Margins (run, N, uav, neighbour) by readings that ask for the same in all directions [m]."""
@@ -372,7 +382,7 @@ def margin_attainable(
     lead = covariance.shape[:-3]
     kept = np.empty((math.prod(lead), uavs, uavs), dtype=np.bool_)
     factor = common_factor.reshape(len(kept), *common_factor.shape[-3:])
-    _keeps(
+    _keep(
         plain(covariance.reshape(len(kept), uavs, 3, 3)),
         _cross(factor),
         inflation.k,
@@ -385,7 +395,7 @@ def margin_attainable(
 
 
 @compiled
-def _keeps(
+def _keep(
     covariance: Array, cross: Array, k: float, normal: Array, room: Array, reach: Array, kept: Mask
 ) -> None:
     """Write whether pairs have room (uav, uav) for their reach and k sigma along their normals."""
@@ -393,12 +403,80 @@ def _keeps(
     for run in range(kept.shape[0]):
         for i in range(kept.shape[1]):
             for j in range(kept.shape[1]):
-                for a in range(3):
-                    for b in range(3):
-                        both = covariance[run, i, a, b] + covariance[run, j, a, b]
-                        relative[a, b] = both - cross[run, i, j, a, b]
-                margin = k * sigma_along(relative, normal[i, j, 0], normal[i, j, 1], normal[i, j, 2])
-                kept[run, i, j] = i == j or room[i, j] >= reach[i, j] + margin
+                kept[run, i, j] = _keeps(covariance, cross, run, i, j, k, normal, room, reach, relative)
+
+
+@compiled_bare
+def _keeps(
+    covariance: Array, cross: Array, run: int, i: int, j: int, k: float, normal: Array, room: Array,
+    reach: Array, relative: Array,
+) -> bool:  # fmt: skip
+    """Whether one pair has; ``relative`` (3, 3) is room to work in."""
+    for a in range(3):
+        for b in range(3):
+            both = covariance[run, i, a, b] + covariance[run, j, a, b]
+            relative[a, b] = both - cross[run, i, j, a, b]
+    margin = k * sigma_along(relative, normal[i, j, 0], normal[i, j, 1], normal[i, j, 2])
+    return bool(i == j or room[i, j] >= reach[i, j] + margin)
+
+
+class ShortMargins:
+    """Who could not keep a margin to another UAV even where the formation itself is flown perfectly.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation, mission and vehicle.
+    inflation : Inflation
+        How k sigma enters.
+    """
+
+    def __init__(self, problem: Problem, inflation: Inflation) -> None:
+        assert isinstance(problem.mission, FormationMission)
+        self._problem, self._inflation = problem, inflation
+        distance_m = _distance(None, problem)
+        self._planes = _between_slots(problem.formation, problem.mission, distance_m, 1.0)
+
+    def count(
+        self, covariance: Array, common_factor: Array, trusted: Mask, counts: NDArray[np.int64]
+    ) -> None:
+        """Add the trusted UAVs of each run whose margin to another :func:`margin_attainable` calls short.
+
+        Parameters
+        ----------
+        covariance, common_factor : array, shapes (run, uav, 3, 3) and (run, uav, 3, rank)
+            As reported [m^2], [m]; of a UAV that is not trusted they count as zero.
+        trusted : array of bool, shape (run, uav)
+            Whose navigation is trusted.
+        counts : array of int, shape (run,)
+            Added to.
+        """
+        if not trusted.all():
+            known = trusted[..., None, None]
+            covariance = np.where(known, covariance, 0.0)
+            common_factor = np.where(known, common_factor, 0.0)
+        inflation = self._inflation
+        if inflation.reading in ("directional", "chi2"):
+            cross, planes = _cross(common_factor), self._planes
+            _count_short(plain(covariance), cross, inflation.k, *planes, trusted, counts)
+        else:
+            kept = margin_attainable(self._problem, covariance, common_factor, inflation=inflation)
+            counts += (trusted & ~kept.all(-1)).sum(-1)
+
+
+@compiled
+def _count_short(
+    covariance: Array, cross: Array, k: float, normal: Array, room: Array, reach: Array, trusted: Mask,
+    counts: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Count trusted UAVs with a pair that :func:`_keeps` says has no room."""
+    relative = np.empty((3, 3))
+    for run in range(trusted.shape[0]):
+        for i in range(trusted.shape[1]):
+            short = 0
+            for j in range(trusted.shape[1]):
+                short += not _keeps(covariance, cross, run, i, j, k, normal, room, reach, relative)
+            counts[run] += short > 0 and trusted[run, i]
 
 
 @lru_cache(maxsize=16)

@@ -47,8 +47,10 @@ def drawn_together(
         References; a UAV more than ``LARGEST_PULL_M`` off counts as this far.
     """
     out = reference.copy()
-    shares = plain(np.broadcast_to(np.asarray(share, dtype=np.float64), reference.shape[:3]))
-    _draw(plain(plans), plain(free), counted, plain(frame.axes), shares, out)
+    shares = np.asarray(share, dtype=np.float64)
+    if shares.shape != reference.shape[:3]:
+        shares = np.broadcast_to(shares, reference.shape[:3])
+    _draw(plain(plans), plain(free), counted, plain(frame.axes), plain(shares), out)
     return out
 
 

@@ -54,8 +54,8 @@ class Ladder:
 
     def all_accepted(self) -> Codes:
         """What :meth:`decide` says where every plan was accepted."""
-        self._hovering_since = np.full(self._last.shape, np.nan)
-        self._last = np.full(self._last.shape, Action.PLAN, dtype=np.int8)
+        self._hovering_since.fill(np.nan)
+        self._last = np.zeros(self._last.shape, dtype=np.int8)  # Action.PLAN
         return self._last
 
     def decide(

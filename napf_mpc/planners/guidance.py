@@ -9,7 +9,6 @@ formation slows, holds in front of it, and if the hold lasts too long, gives up 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +50,9 @@ def guidance_covariance(nav: NavSolution, trusted: NDArray[np.bool_], ahead: Arr
     """
     room = nav.position_covariance
     if ahead is not None and nav.forecast is not None:
-        room = np.where(nav.forecast.fixes[..., None, None], ahead, room)
-    return np.asarray(np.where(trusted[..., None, None], room, np.eye(3)))
+        fixes = nav.forecast.fixes
+        room = ahead if fixes.all() else np.where(fixes[..., None, None], ahead, room)
+    return room if trusted.all() else np.where(trusted[..., None, None], room, np.eye(3))
 
 
 class Guidance:
@@ -160,8 +160,8 @@ class Guidance:
         Guide
             Offsets from where each UAV is now.
         """
-        self._position = np.where(trusted[..., None], position, self._position)
-        self._covariance = np.where(trusted[..., None, None], covariance, self._covariance)
+        np.copyto(self._position, position, where=trusted[..., None])
+        np.copyto(self._covariance, covariance, where=trusted[..., None, None])
         place = self._path.to_path(self._position)
         along = np.ascontiguousarray(place[..., 0])
         due = time_s >= self._next_s - 1e-9
@@ -279,7 +279,8 @@ class Guidance:
 
     def _guide(self, along: Array) -> Guide:
         settings, offset = self.settings, self._from(self._profiles, along)
-        sigma = np.sqrt(np.maximum(np.einsum("ruab,a,b->ru", self._covariance, *[self._path.along] * 2), 0.0))
+        sigma = np.empty(along.shape)
+        _sigma_along(self._covariance, self._path.along, sigma)
         error = synchronisation_error(along, self._slots[:, 0])
         pace, breach = np.empty(along.shape), np.empty(along.shape)
         reason = np.empty(along.shape, dtype=np.int8)
@@ -287,15 +288,26 @@ class Guidance:
             offset, error, sigma, self._missing, settings.left_behind_m, settings.spare_m, self._pace,
             self._squeezing, self._holding, self._given_up, pace, reason, breach,
         )  # fmt: skip
-        guide = Guide(self.ahead_m, offset, pace, reason, breach)
         if self._taut is None:
-            return guide
+            return Guide(self.ahead_m, offset, pace, reason, breach)
         taut = self._from(self._taut, along)
-        return replace(guide, taut=taut[..., :2], loose=taut[..., 2])
+        return Guide(self.ahead_m, offset, pace, reason, breach, taut[..., :2], taut[..., 2])
 
 
 # Codes as plain numbers, for the compiled loop.
 _NONE, _DETOUR, _WAIT, _SQUEEZE, _HOLD, _NO_PASSAGE = map(int, Passage)
+
+
+@compiled_bare
+def _sigma_along(covariance: Array, along: Array, sigma: Array) -> None:
+    """Write standard deviations (run, uav) along a direction, of covariances (run, uav, 3, 3)."""
+    for run in range(sigma.shape[0]):
+        for uav in range(sigma.shape[1]):
+            variance = 0.0
+            for a in range(3):
+                for b in range(3):
+                    variance += covariance[run, uav, a, b] * along[a] * along[b]
+            sigma[run, uav] = math.sqrt(max(variance, 0.0))
 
 
 @compiled_bare

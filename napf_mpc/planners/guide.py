@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
-
-from napf_mpc.jit import compiled_bare
 
 Array = NDArray[np.float64]
 
@@ -53,26 +51,6 @@ class Guide:
     loose: Array | None = None
     """(run, uav, K) part 0 to 1 of the way to the lane that is free, by default none."""
 
-    def on_lanes(self) -> Guide:
-        """The same pace along the lanes themselves."""
-        return replace(self, offset=np.zeros_like(self.offset))
-
-    def pulled(self) -> Guide:
-        """The same guide along its taut way, but for UAVs that hold: those have no other way on."""
-        if self.taut is None:
-            return self
-        holds = self.reason >= Passage.HOLD
-        return replace(self, offset=np.where(holds[..., None, None], self.offset, self.taut))
-
-    def loose_at(self, ahead_m: Array) -> Array:
-        """How loose the way is (run, uav, N) at distances ahead (run, uav, N) of UAVs that do not hold."""
-        if self.loose is None:
-            return np.zeros(ahead_m.shape)
-        out = np.empty(ahead_m.shape)
-        ahead, loose = np.ascontiguousarray(ahead_m), np.ascontiguousarray(self.loose)
-        _loose(ahead, loose, self.reason, self._spacing, out)
-        return out
-
     def at(self, ahead_m: Array | float) -> Array:
         """Offsets at distances ahead, linear between the places and level beyond them [m].
 
@@ -100,15 +78,3 @@ class Guide:
         place = np.clip(np.asarray(ahead) / self._spacing, 0.0, len(self.ahead_m) - 1.0)
         index = np.minimum(place.astype(np.int64), len(self.ahead_m) - 2)
         return index, place - index
-
-
-@compiled_bare
-def _loose(ahead_m: Array, loose: Array, reason: NDArray[np.int8], spacing_m: float, out: Array) -> None:
-    """Write how loose ways (run, uav, K) are at distances ahead (run, uav, N); not at all where UAVs hold."""
-    last = loose.shape[2] - 1
-    for run in range(out.shape[0]):
-        for uav in range(out.shape[1]):
-            holds = reason[run, uav] >= HOLD
-            for n in range(out.shape[2]):
-                place = min(max(ahead_m[run, uav, n] / spacing_m, 0.0), float(last))
-                out[run, uav, n] = 0.0 if holds else loose[run, uav, min(int(place), last - 1)]

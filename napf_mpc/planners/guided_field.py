@@ -114,8 +114,12 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
 
 def waiting_reasons(guide: Guide) -> NDArray[np.int8]:
     """Codes of :class:`~napf_mpc.planners.planner.Reason` for UAVs that guidance holds."""
-    held = np.where(guide.reason == Passage.HOLD, Reason.WAITING, Reason.NONE)
-    return np.where(guide.reason == Passage.NO_PASSAGE, Reason.NO_PASSAGE, held).astype(np.int8)
+    return _HELD[guide.reason]
+
+
+_HELD = np.zeros(len(Passage), dtype=np.int8)
+"""Code of a reason for each passage."""
+_HELD[Passage.HOLD], _HELD[Passage.NO_PASSAGE] = Reason.WAITING, Reason.NO_PASSAGE
 
 
 def _limited(vectors: Array, most: float) -> Array:

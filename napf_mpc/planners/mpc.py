@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,16 +13,17 @@ from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, InputBox, SpeedLimit, TiltLimit
 from napf_mpc.constraints.moving import MovingObstacleContact
-from napf_mpc.constraints.neighbours import NeighbourSeparation, margin_attainable
+from napf_mpc.constraints.neighbours import NeighbourSeparation, ShortMargins
 from napf_mpc.constraints.passage import passage_margins
 from napf_mpc.constraints.probability import sigma_along
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.formation import PathFrame
-from napf_mpc.jit import compiled, compiled_bare
+from napf_mpc.jit import compiled
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
+from napf_mpc.planners import passes
 from napf_mpc.planners.cohesion import drawn_together
-from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
+from napf_mpc.planners.fallback import Action, Codes, Ladder
 from napf_mpc.planners.guess import cut_at_obstacles
 from napf_mpc.planners.guidance import Guidance, guidance_covariance
 from napf_mpc.planners.guide import Guide
@@ -30,7 +31,7 @@ from napf_mpc.planners.guided_field import waiting_reasons
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
 from napf_mpc.planners.planner import Command, Reason
 from napf_mpc.planners.references import SlotReference
-from napf_mpc.planners.tally import COUNTED, FALL_BACKS, Tally
+from napf_mpc.planners.tally import COLUMNS, COUNTED, Tally
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem import Planner as Settings
 from napf_mpc.qp import STATES, HorizonQp
@@ -61,6 +62,12 @@ SPEED_PRICE = (1000.0, 1000.0)
 """Prices of a speed slack: above what the margins can gain by it, so that no margin buys a dash."""
 _CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
 _WORDS = np.array([status.value for status in STATUSES])
+_COLUMN = np.array(
+    [COLUMNS.index(f"solves_{status.value}") if status in COUNTED else -1 for status in STATUSES]
+)
+_ITERATIONS = COLUMNS.index("iterations")
+_SHORT = COLUMNS.index("margin_short")
+_NO_REASON = int(Reason.NONE)
 
 
 def default_constraints(problem: Problem) -> list[Constraint]:
@@ -156,9 +163,11 @@ class QpPlanner:
         self._inflation = Inflation.of_problem(problem)
         margins = passage_margins(self._inflation) if settings.margin == "passage" else None
         self._guidance = Guidance(problem, self._inflation, margins=margins) if follows else None
+        self._short = ShortMargins(problem, self._inflation) if problem.uav_count > 1 else None
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
         self._period_s = 1.0 / settings.rate_hz
         step = stage_grid(self._period_s, settings.horizon, settings.look_ahead_s)
+        self._grid = np.append(0.0, step)  # now, and the ends of the stages
         self._yaw = self._frame.heading_rad
         self._model = horizon_model(problem.vehicle, self._yaw, step, *weights(settings))
         chosen = settings.solver if solver is None else solver
@@ -188,7 +197,9 @@ class QpPlanner:
         if self._guidance is not None:
             self._guidance.reset(obstacles, runs)
         self.ladder = Ladder(runs, uavs)
-        self.tally = replace(Tally.none(runs), events=self.ladder.events)
+        self._counts = np.zeros((len(COLUMNS), runs), dtype=np.int64)
+        self.tally = replace(Tally.over(self._counts), events=self.ladder.events)
+        self._outlines: list[Hashable] = []
 
     def build(self, nav: NavSolution, time_s: float) -> HorizonQp:
         """Programs of this step, in coordinates whose origin is each UAV's reported position."""
@@ -208,7 +219,7 @@ class QpPlanner:
         airborne = np.ones(nav.available.shape, dtype=bool) if nav.airborne is None else nav.airborne
         trusted = nav.trusted() & airborne
         self._tracks = nav.tracks
-        self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
+        np.copyto(self._anchor, nav.position, where=trusted[..., None])
         state = self._state(nav, trusted)
         covariance = self._covariance(nav, trusted)
         guide = None
@@ -227,29 +238,47 @@ class QpPlanner:
         answer = self._solve(state, reference, guess, covariance, nav, trusted, time_s)
         late = self._clock is not None and not self._clock() - began <= self._period_s
         refused = refusals(answer, self._limits)
-        upset = np.abs(state[..., 6:10:2]).max(-1) > UPSET_RAD
-        accepted = (refused == Refusal.NONE) & trusted & ~upset & (not late)
-        causes = None if accepted.all() else _causes(answer, refused, upset, late, trusted, airborne)
+        accepted, upset = np.empty((2, *trusted.shape), dtype=np.bool_)
+        everybody = passes.accept(refused, state, trusted, late, UPSET_RAD, upset, accepted)
+        causes = None if everybody else _causes(answer, refused, upset, late, trusted, airborne)
         flown, action = self._choose(time_s, state, answer, accepted, trusted & ~upset, causes)
         self._plan, self._answer = flown, answer
         slack = self._contact_slack(answer, flown, accepted)
-        self._count(answer, slack, action, accepted, trusted, airborne)
-        self._count_short_margins(nav, trusted)
-        on_plan = action <= Action.TAIL
-        down = np.where(action == Action.DESCEND, -DESCENT_MPS, 0.0)[..., None] * self._frame.up
-        planned = on_plan[..., None]
-        reason = _reasons(action, trusted)
+        passes.count(
+            answer.status, _COLUMN, answer.iterations, action, accepted, trusted, airborne, slack,
+            _ITERATIONS, self._counts, self.tally.largest_slack_m,
+        )  # fmt: skip
+        if self._short is not None:
+            short = self._counts[_SHORT]
+            self._short.count(nav.position_covariance, nav.common_factor, trusted, short)
+        return self._command(action, trusted, flown, guide, slack, answer)
+
+    def _command(
+        self,
+        action: Codes,
+        trusted: Mask,
+        flown: Plan,
+        guide: Guide | None,
+        slack: Array,
+        answer: BatchResult,
+    ) -> Command:
+        """Fly the plans; where the ladder says so, hold the last known place, or go down there."""
+        position, velocity, direction = vectors = np.empty((3, *self._anchor.shape))
+        planned, reason = np.empty(trusted.shape, dtype=np.bool_), np.empty(trusted.shape, dtype=np.int8)
+        passes.command(
+            action, trusted, flown.initial, self._anchor, plain(self._frame.up), vectors, planned, reason
+        )
         if guide is not None:
             reason = np.maximum(reason, waiting_reasons(guide))
         return Command(
-            position=np.where(planned, flown.initial[..., POSITION], self._anchor),
-            velocity=np.where(planned, flown.initial[..., VELOCITY], down),
-            direction=np.where(planned, 0.0, down),
+            position=position,
+            velocity=velocity,
+            direction=direction,
             yaw=np.full(trusted.shape, self._yaw),
-            holding=reason > Reason.NONE,
+            holding=reason > _NO_REASON,
             feedforward=np.zeros((*trusted.shape, 4)),
             plan=flown,
-            planned=on_plan,
+            planned=planned,
             reason=reason,
             slack_m=slack,
             solver_status=_WORDS[answer.status],
@@ -270,21 +299,21 @@ class QpPlanner:
 
     def _state(self, nav: NavSolution, trusted: Mask) -> Array:
         """State (run, uav, 12) as reported; a UAV that is not trusted stands at its last known place."""
-        state = np.zeros((*trusted.shape, STATES))
-        state[..., POSITION] = self._anchor
-        state[..., 10] = self._yaw
-        known = np.empty_like(state)
-        known[..., POSITION], known[..., VELOCITY] = nav.position, nav.velocity
-        known[..., 6:12:2], known[..., 7:12:2] = nav.attitude, nav.body_rates
-        return np.where(trusted[..., None], known, state)
+        state = np.empty((*trusted.shape, STATES))
+        passes.report(
+            plain(nav.position), plain(nav.velocity), plain(nav.attitude), plain(nav.body_rates), trusted,
+            self._anchor, self._yaw, state,
+        )  # fmt: skip
+        return state
 
     def _carried(self, state: Array, time_s: float) -> tuple[Array, Array] | None:
         """States and inputs of the last plans on this step's grid, moved to where navigation is now."""
         if self._plan is None:
             return None
-        states, inputs = self._plan.resampled(time_s, self._model.step_s)
-        states[..., POSITION] += (state - self._plan.at(time_s)[0])[:, :, None, POSITION]
-        return states, inputs
+        states, inputs = self._plan.resampled(time_s, self._grid)
+        moved, held = np.empty((*state.shape[:2], self._model.stages, STATES)), inputs[:, :, 1:]
+        passes.follow(states, state, moved)
+        return moved, plain(held)
 
     def _references(
         self,
@@ -302,13 +331,11 @@ class QpPlanner:
         if guide is None:
             free = reference = way = self._slots.over_from(here, times)
         else:
-            way = self._slots.over_from(here, times, guide)
             if guide.taut is None:
+                way = self._slots.over_from(here, times, guide)
                 return way, way
-            free = self._slots.over_from(here, times, guide.on_lanes())
-            reference = self._slots.over_from(here, times, guide.pulled())
-            ahead = self._frame.along_track(free[..., POSITION]) - here.place[..., :1]
-            share = share * guide.loose_at(ahead)
+            way, reference, free, loose = self._slots.ways_from(here, times, guide)
+            share = share * loose
         if carried is not None and len(self._lanes) > 1:
             reference = drawn_together(reference, free, carried[0], trusted, share, self._frame)
         return reference, way
@@ -325,24 +352,26 @@ class QpPlanner:
         states, inputs = carried
         if self._guidance is not None:
             # Rows made at a plan that stands before an obstacle hold it there: the guide's way leads past.
-            now = self._frame.along_track(state[..., POSITION])
-            asked = self._frame.along_track(way[:, :, -1, POSITION]) - now
-            planned = self._frame.along_track(states[:, :, -1, POSITION]) - now
-            stuck = (asked > STUCK_M) & (planned < STUCK_PART * asked)
-            states = np.where(stuck[..., None, None], way, states)
+            frame, led = self._frame, np.empty_like(states)
+            passes.take_way(
+                states, way, state, plain(frame.origin), plain(frame.along), STUCK_M, STUCK_PART, led
+            )
+            states = led
         return states, inputs
 
     def _horizon(
         self, guess: Array, covariance: Array, nav: NavSolution, trusted: Mask, time_s: float
     ) -> Horizon:
-        known = trusted[..., None, None]
+        position, velocity = np.empty((2, *guess.shape[:3], 3))
+        passes.places(plain(guess), position, velocity)
+        shared = _shared_ahead(nav, covariance)
         return Horizon(
             time_s=time_s,
             step_s=self._model.step_s,
-            position=cut_at_obstacles(guess[..., POSITION], self._obstacles),
-            velocity=np.ascontiguousarray(guess[..., VELOCITY]),
+            position=cut_at_obstacles(position, self._obstacles),
+            velocity=velocity,
             covariance=covariance,
-            common_factor=np.where(known, _shared_ahead(nav, covariance), 0.0),
+            common_factor=shared if trusted.all() else np.where(trusted[..., None, None], shared, 0.0),
             obstacles=self._obstacles,
             frame=self._frame,
             problem=self.problem,
@@ -364,8 +393,11 @@ class QpPlanner:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
         origin = np.ascontiguousarray(state[..., POSITION])
         blocks: list[LinearRows] = [constraint.rows(horizon) for constraint in self.constraints]
-        for constraint, block in zip(self.constraints, blocks, strict=True):
-            block.check_shapes(horizon.shape, constraint.name)
+        outlines = [horizon.shape, *[block.outline() for block in blocks]]
+        if outlines != self._outlines:
+            for constraint, block in zip(self.constraints, blocks, strict=True):
+                block.check_shapes(horizon.shape, constraint.name)
+            self._outlines = outlines
         blocks = [block.shifted(origin) if block.signal == "position" else block for block in blocks]
         return HorizonQp(self._model, _moved(state, -origin), _moved(reference, -origin), tuple(blocks))
 
@@ -418,7 +450,7 @@ class QpPlanner:
         old, step_s = self._plan, self._model.step_s
         new = Plan(
             self.problem.vehicle, self._yaw, time_s, step_s, state,
-            _moved(answer.states, np.ascontiguousarray(state[..., POSITION])), answer.inputs,
+            _moved(answer.states, np.ascontiguousarray(state[..., POSITION])), plain(answer.inputs),
         )  # fmt: skip
         if causes is None:
             self._made_s[:] = time_s
@@ -444,41 +476,22 @@ class QpPlanner:
             least = np.minimum(least, moving)
         return np.asarray(least - self.problem.vehicle.radius_m)
 
-    def _count(
-        self, answer: BatchResult, slack: Array, action: Codes, accepted: Mask, trusted: Mask, airborne: Mask
-    ) -> None:
-        tally = self.tally
-        for code in set(answer.status[trusted].tolist()):
-            if STATUSES[code] in COUNTED:
-                tally.add(f"solves_{STATUSES[code].value}", trusted & (answer.status == code))
-        tally.add("iterations", trusted, np.maximum(answer.iterations, 0))
-        if (trusted & ~accepted).any():
-            tally.add("answers_refused", trusted & ~accepted)
-        for rung, name in enumerate(FALL_BACKS, start=1):
-            if (airborne & (action == rung)).any():
-                tally.add(f"fall_back_{name}", airborne & (action == rung))
-        np.fmax(tally.largest_slack_m, np.fmax.reduce(slack, axis=-1), out=tally.largest_slack_m)
-
     def _contact_slack(self, answer: BatchResult, flown: Plan, accepted: Mask) -> Array:
         """Most that each new plan (run, uav) is inside an obstacle's margin, NaN without one [m]."""
-        most = np.full(accepted.shape, np.nan)
+        most: Array | None = None
         for constraint, slack in zip(self.constraints, answer.slacks, strict=True):
             if isinstance(constraint, ObstacleContact) and self._last_horizon is not None:
                 # Not the slack: a row may ask for less than the margin, see its opening speed.
                 place = np.ascontiguousarray(flown.states[..., POSITION])
-                most = np.fmax(most, constraint.shortfall(self._last_horizon, place))
+                found = constraint.shortfall(self._last_horizon, place)
             elif isinstance(constraint, MovingObstacleContact):
-                most = np.fmax(most, slack.max(axis=(2, 3), initial=0.0))
-        return np.where(accepted, most, np.nan)
-
-    def _count_short_margins(self, nav: NavSolution, trusted: Mask) -> None:
-        """Count UAVs whose margin to some other UAV the formation itself, flown perfectly, could not keep."""
-        if len(self._lanes) > 1:
-            known = trusted[..., None, None]
-            covariance = np.where(known, nav.position_covariance, 0.0)
-            shared = np.where(known, nav.common_factor, 0.0)
-            kept = margin_attainable(self.problem, covariance, shared, inflation=self._inflation)
-            self.tally.add("margin_short", trusted & ~kept.all(-1))
+                found = slack.max(axis=(2, 3), initial=0.0)
+            else:
+                continue
+            most = found if most is None else np.fmax(most, found)
+        if most is None:
+            return np.full(accepted.shape, np.nan)
+        return most if accepted.all() else np.where(accepted, most, np.nan)
 
 
 def _causes(
@@ -490,11 +503,6 @@ def _causes(
         words[place] = f"{words[place]}: {message}"
     causes = np.where(upset, "upset", np.where(late, "late", words))
     return np.where(trusted, causes, np.where(airborne, "navigation", ""))
-
-
-def _reasons(action: Codes, trusted: Mask) -> Codes:
-    waiting = action > Action.TAIL
-    return np.where(waiting, np.where(trusted, Reason.SOLVER, Reason.NAVIGATION), Reason.NONE).astype(np.int8)
 
 
 def _shared_ahead(nav: NavSolution, covariance: Array) -> Array:
@@ -515,7 +523,7 @@ def _moved(states: Array, by: Array) -> Array:
     """States (run, uav, ..., 12) with their positions moved by (run, uav, 3), the same at all stages."""
     out = np.empty(states.shape)
     runs, uavs = states.shape[:2]
-    _move(states.reshape(runs, uavs, -1, STATES), by, out.reshape(runs, uavs, -1, STATES))
+    passes.move(states.reshape(runs, uavs, -1, STATES), by, out.reshape(runs, uavs, -1, STATES))
     return out
 
 
@@ -534,14 +542,3 @@ def _along_axes(now: Array, ahead: Array, filtered: bool, trusted: Mask, axes: A
                     passing[a, b] = now[run, uav, a, b] - kept if trusted[run, uav] else 0.0
             for n in range(3):
                 sigma[run, uav, n] = sigma_along(passing, axes[n, 0], axes[n, 1], axes[n, 2])
-
-
-@compiled_bare
-def _move(states: Array, by: Array, out: Array) -> None:
-    for run in range(states.shape[0]):
-        for uav in range(states.shape[1]):
-            for k in range(states.shape[2]):
-                for i in range(STATES):
-                    out[run, uav, k, i] = states[run, uav, k, i]
-                for axis in range(3):
-                    out[run, uav, k, 2 * axis] += by[run, uav, axis]

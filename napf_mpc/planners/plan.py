@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.problem import Vehicle
 from napf_mpc.qp import INPUTS, STATES, HorizonModel
+from napf_mpc.vehicle.plant import plain
 from napf_mpc.vehicle.quadrotor import discretize, linearize
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+_NOW = np.zeros(1)
+"""A grid of a single time."""
 
 
 @lru_cache(maxsize=4096)
@@ -25,8 +29,9 @@ def _held(vehicle: Vehicle, yaw_rad: float, step_s: float) -> tuple[Array, Array
 
 
 @lru_cache(maxsize=256)
-def _maps(vehicle: Vehicle, yaw_rad: float, into_s: tuple[float, ...]) -> tuple[Index, Array, Array]:
-    """Transposed holds over times [s], and which of them belongs to each time: -1 for a time of zero."""
+def _maps(vehicle: Vehicle, yaw_rad: float, into_ns: bytes) -> tuple[Index, Array, Array]:
+    """Transposed holds over times [ns], and which of them belongs to each time: -1 for a time of zero."""
+    into_s = [round(1e-9 * into, 9) for into in np.frombuffer(into_ns, dtype=np.int64).tolist()]
     pairs = [_held(vehicle, yaw_rad, into) for into in into_s if into > 0.0]
     which = np.cumsum([into > 0.0 for into in into_s]) - 1
     which[[into == 0.0 for into in into_s]] = -1
@@ -35,37 +40,71 @@ def _maps(vehicle: Vehicle, yaw_rad: float, into_s: tuple[float, ...]) -> tuple[
     return which, a, b
 
 
-@compiled
-def _find(starts_s: Array, made_s: float, times_s: Array, stage: Index, into_s: Array) -> None:
-    """Write the stage of each time, the last one endless, and how far into it the time is [s]."""
-    for n in range(len(times_s)):
-        age = max(0.0, times_s[n] - made_s)
-        k = 0
-        # A node belongs to the stage that starts there; rounding of the clock must not look one stage back.
-        while k + 1 < len(starts_s) and starts_s[k + 1] <= age + 1e-9:
-            k += 1
-        stage[n], into_s[n] = k, max(0.0, age - starts_s[k])
+@compiled_bare
+def _stage_of(step_s: Array, age_s: float) -> tuple[int, float]:
+    """Stage of an age, the last one endless, and how far into it that is [s]."""
+    age, k, start = max(0.0, age_s), 0, 0.0
+    # A node belongs to the stage that starts there; rounding of the clock must not look one stage back.
+    while k < len(step_s) and start + step_s[k] <= age + 1e-9:
+        start += step_s[k]
+        k += 1
+    return k, max(0.0, age - start)
 
 
-@compiled
-def _carry(nodes: Array, held: Array, stage: Index, which: Index, a: Array, b: Array, out: Array) -> None:
-    """Write states at some times into out (run, uav, time, 12).
+@compiled_bare
+def _find(
+    step_s: Array, made_s: float, time_s: float, grid_s: Array, stage: Index, into_ns: Index, during: Index
+) -> None:
+    """Find the ends of the stages of a grid that starts at a time in plans made at another.
 
     Parameters
     ----------
-    nodes, held : array, shapes (run, uav, N + 1, 12) and (run, uav, N + 1, 4)
-        States where each stage starts, and inputs during it; the last stage is endless.
-    stage, which : array, shape (time,)
-        Stage of each time, and the map from where it starts to then; -1 for none.
+    step_s, grid_s : array, shapes (N,) and (time,)
+        Lengths of the plans' stages, and of the grid's [s].
+    made_s, time_s : float
+        When plans and grid start [s].
+    stage, into_ns : array of int, shape (time,)
+        Out: stage of each end, and how far into it that is [ns].
+    during : array of int, shape (time,)
+        Out: stage of each beginning.
+    """
+    after = 0.0
+    for n in range(len(grid_s)):
+        after += grid_s[n]
+        end = time_s + after
+        during[n] = _stage_of(step_s, (end - grid_s[n]) - made_s)[0]
+        k, into = _stage_of(step_s, end - made_s)
+        stage[n], into_ns[n] = k, int(np.rint(1e9 * into)) if into >= 1e-9 else 0
+
+
+@compiled
+def _carry(
+    initial: Array, states: Array, inputs: Array, stage: Index, during: Index, which: Index, a: Array,
+    b: Array, out: Array, held: Array,
+) -> None:  # fmt: skip
+    """Write states at some times into out (run, uav, time, 12), and inputs into held (run, uav, time, 4).
+
+    Parameters
+    ----------
+    initial, states, inputs : array, shapes (run, uav, 12), (run, uav, N, 12) and (run, uav, N, 4)
+        Plans; after the last stage there is no input.
+    stage, during, which : array, shape (time,)
+        Stage of each time's state and of its input, and the map from where the stage starts to then; -1 for
+        none.
     a, b : array, shapes (map, 12, 12) and (map, 4, 12)
         Maps of state and input, transposed.
     """
-    pushed = np.empty(STATES)
-    for run in range(nodes.shape[0]):
-        for uav in range(nodes.shape[1]):
+    pushed, rest = np.empty(STATES), np.zeros(INPUTS)
+    last = inputs.shape[2]
+    for run in range(states.shape[0]):
+        for uav in range(states.shape[1]):
             for n in range(len(stage)):
-                x, u, to = nodes[run, uav, stage[n]], held[run, uav, stage[n]], out[run, uav, n]
-                m = which[n]
+                k, m, to = stage[n], which[n], out[run, uav, n]
+                x = initial[run, uav] if k == 0 else states[run, uav, k - 1]
+                u = inputs[run, uav, k] if k < last else rest
+                kept = inputs[run, uav, during[n]] if during[n] < last else rest
+                for j in range(INPUTS):
+                    held[run, uav, n, j] = kept[j]
                 if m < 0:
                     to[:] = x
                     continue
@@ -157,48 +196,26 @@ class Plan:
     inputs: Array
     """(run, uav, N, 4) inputs about hover during each stage."""
 
-    @cached_property
-    def _starts(self) -> Array:
-        """(N + 1,) times from the plan's start at which its stages start; the last one is endless [s]."""
-        return np.append(0.0, np.cumsum(self.step_s))
-
-    @cached_property
-    def _nodes(self) -> Array:
-        """(run, uav, N + 1, 12) states where the stages start."""
-        return np.concatenate([self.initial[:, :, None], self.states], axis=2)
-
-    @cached_property
-    def _inputs(self) -> Array:
-        """(run, uav, N + 1, 4) inputs during the stages."""
-        return np.concatenate([self.inputs, np.zeros((*self.initial.shape[:2], 1, INPUTS))], axis=2)
-
     def at(self, time_s: float) -> tuple[Array, Array]:
         """State (run, uav, 12) and input about hover (run, uav, 4) at a time, by exact zero-order hold.
 
         After the last stage the inputs are zero and the model runs on.
         """
-        stage, into = self._stages(np.array([time_s]))
-        state = self._states_at(stage, into).reshape(self.initial.shape)
-        return state, np.ascontiguousarray(self._inputs[:, :, stage[0]])
+        states, inputs = self.resampled(time_s, _NOW)
+        return states.reshape(self.initial.shape), inputs.reshape(*self.initial.shape[:2], INPUTS)
 
     def resampled(self, time_s: float, step_s: Array) -> tuple[Array, Array]:
         """States (run, uav, N, 12) and inputs (run, uav, N, 4) of these plans on a grid that starts later."""
-        times = time_s + np.cumsum(step_s)
-        during, _ = self._stages(times - step_s)
-        return self._states_at(*self._stages(times)), self._inputs.take(during, axis=2)
-
-    def _stages(self, times_s: Array) -> tuple[Index, Array]:
-        """Stages at times (n,), and how far into them the times are [s]."""
-        stage, into = np.empty(len(times_s), dtype=np.int64), np.empty(len(times_s))
-        _find(self._starts, self.made_s, times_s, stage, into)
-        return stage, into
-
-    def _states_at(self, stage: Index, into_s: Array) -> Array:
-        """States (run, uav, n, 12) in stages, some time after their starts, both (n,)."""
-        rounded = tuple([round(time, 9) if time >= 1e-9 else 0.0 for time in into_s.tolist()])
-        out = np.empty((*self.initial.shape[:2], len(rounded), STATES))
-        _carry(self._nodes, self._inputs, stage, *_maps(self.vehicle, self.yaw_rad, rounded), out)
-        return out
+        places = np.empty((3, len(step_s)), dtype=np.int64)
+        stage, into_ns, during = places
+        _find(plain(self.step_s), self.made_s, time_s, plain(step_s), stage, into_ns, during)
+        shape = (*self.initial.shape[:2], len(step_s))
+        states, inputs = np.empty((*shape, STATES)), np.empty((*shape, INPUTS))
+        _carry(
+            plain(self.initial), plain(self.states), plain(self.inputs), stage, during,
+            *_maps(self.vehicle, self.yaw_rad, into_ns.tobytes()), states, inputs,
+        )  # fmt: skip
+        return states, inputs
 
     def resumed(self, time_s: float, step_s: Array) -> Plan:
         """The same plans from a later time on, on a grid that starts there."""

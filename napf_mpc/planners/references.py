@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.formation import PathFrame, formation_offsets, synchronisation_error
 from napf_mpc.jit import compiled, compiled_bare
-from napf_mpc.planners.guide import Guide
+from napf_mpc.planners.guide import HOLD, Guide
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.qp import STATES
 from napf_mpc.vehicle.plant import plain
@@ -32,6 +32,19 @@ class Here(NamedTuple):
     """(run, uav, 3) of what will prove to have been error, along, left and up [m]."""
     behind: Array
     """(run, uav) how far the slot is ahead, as far as believed [m]."""
+
+
+class Ways(NamedTuple):
+    """States (run, uav, N, 12) along which a guide leads from where the UAVs are."""
+
+    way: Array
+    """As guidance has found it."""
+    pulled: Array
+    """Pulled taut; what to track."""
+    free: Array
+    """On the lanes."""
+    loose: Array
+    """(run, uav, N) part 0 to 1 of the way to the lane that is free."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,12 +91,13 @@ class SlotReference:
 
     def here(self, position: Array, sigma_m: Array | float = 0.0) -> Here:
         """Where references start; parameters are those of :meth:`over`."""
-        place = self.frame.to_path(position)
-        ahead = synchronisation_error(place[..., 0], self.offsets[:, 0])
-        sigma = plain(np.broadcast_to(np.asarray(sigma_m, dtype=np.float64), place.shape))
-        behind = np.empty(ahead.shape)
-        _believe(ahead, sigma, behind)
-        return Here(plain(position), place, sigma, behind)
+        place, behind = self.frame.to_path(position), np.empty(position.shape[:2])
+        sigma = np.asarray(sigma_m, dtype=np.float64)
+        if sigma.shape != place.shape:
+            sigma = np.broadcast_to(sigma, place.shape)
+        here = Here(plain(position), place, plain(sigma), behind)
+        _believe(synchronisation_error(place[..., 0], self.offsets[:, 0]), here.sigma, behind)
+        return here
 
     def over_from(self, here: Here, times_s: Array, guide: Guide | None = None) -> Array:
         """States to track (run, uav, N, 12), as :meth:`over` makes them."""
@@ -93,13 +107,39 @@ class SlotReference:
             here.position, here.place, plain(self.offsets), here.sigma, here.behind, self.speed_mps,
             np.ones((runs, uavs)) if guide is None else plain(guide.pace),
             _NO_BEND if guide is None else plain(guide.ahead_m),
-            _NOWHERE if guide is None else plain(guide.offset),
+            np.empty((runs, uavs, 0, 2)) if guide is None else plain(guide.offset),
             plain(times_s), self.frame.axes, self.frame.heading_rad, out,
         )  # fmt: skip
         return out
 
+    def ways_from(self, here: Here, times_s: Array, guide: Guide) -> Ways:
+        """The guide's way, its taut one and the lanes, as :meth:`over_from` makes each of them.
 
-_NO_BEND, _NOWHERE = np.empty(0), np.empty((0, 0, 0, 2))
+        Parameters
+        ----------
+        here, times_s
+            As in :meth:`over_from`.
+        guide : Guide
+            With a taut way.
+        """
+        assert guide.taut is not None
+        assert guide.loose is not None
+        shape = (*here.behind.shape, len(times_s))
+        ways = Ways(
+            np.zeros((*shape, STATES)),
+            np.zeros((*shape, STATES)),
+            np.zeros((*shape, STATES)),
+            np.empty(shape),
+        )
+        _write_ways(
+            here, plain(self.offsets), self.speed_mps, plain(guide.pace), plain(guide.ahead_m),
+            plain(guide.offset), plain(guide.taut), plain(guide.loose), guide.reason, plain(times_s),
+            self.frame.origin, self.frame.axes, self.frame.heading_rad, ways,
+        )  # fmt: skip
+        return ways
+
+
+_NO_BEND = np.empty(0)
 
 
 @compiled
@@ -119,37 +159,87 @@ def _write(
         Of measurements along, left and up [m].
     behind, pace : array, shape (run, uav)
         How far the slot is ahead, as far as believed [m], and the factor on the speed.
-    ahead_m, bend : array, shapes (K,) and (run, uav, K, 2), or without entries
+    ahead_m, bend : array, shapes (K,) and (run, uav, K, 2), without entries if K is 0
         A guide's distances, and offsets there [m].
     axes : array, shape (3, 3)
         Rows along, left, up.
     """
-    guided = len(ahead_m) > 0
-    here, there, slope, across, start = np.zeros(2), np.zeros(2), np.zeros(2), np.empty(2), np.empty(2)
+    room = np.zeros((5, 2))
     for run in range(out.shape[0]):
         for uav in range(out.shape[1]):
-            if guided:
-                _bend(ahead_m, bend[run, uav], behind[run, uav], here, slope)
-            for a in range(2):
-                across[a] = slots[uav, 1 + a] + here[a] - place[run, uav, 1 + a]
-            size = math.sqrt(across[0] * across[0] + across[1] * across[1])
-            for a in range(2):
-                square, noise = across[a] * across[a], sigma_m[run, uav, 1 + a] * sigma_m[run, uav, 1 + a]
-                believed = square / max(square + noise, 1e-12)
-                start[a] = across[a] * believed * LARGEST_PULL_M / max(size, LARGEST_PULL_M) - here[a]
-            speed = speed_mps * pace[run, uav]
+            _write_one(
+                position[run, uav], place[run, uav], slots[uav], sigma_m[run, uav], behind[run, uav],
+                speed_mps * pace[run, uav], ahead_m, bend[run, uav], times_s, axes, heading_rad, room,
+                out[run, uav],
+            )  # fmt: skip
+
+
+@compiled_bare
+def _write_one(
+    position: Array, place: Array, slot: Array, sigma_m: Array, behind: float, speed: float, ahead_m: Array,
+    bend: Array, times_s: Array, axes: Array, heading_rad: float, room: Array, out: Array,
+) -> None:  # fmt: skip
+    """Write the states (N, 12) of one UAV; ``room`` (5, 2) is to work in, zeros if there is no guide."""
+    guided = len(ahead_m) > 0
+    here, there, slope, across, start = room[0], room[1], room[2], room[3], room[4]
+    if guided:
+        _bend(ahead_m, bend, behind, here, slope)
+    for a in range(2):
+        across[a] = slot[1 + a] + here[a] - place[1 + a]
+    size = math.sqrt(across[0] * across[0] + across[1] * across[1])
+    for a in range(2):
+        square, noise = across[a] * across[a], sigma_m[1 + a] * sigma_m[1 + a]
+        believed = square / max(square + noise, 1e-12)
+        start[a] = across[a] * believed * LARGEST_PULL_M / max(size, LARGEST_PULL_M) - here[a]
+    for n in range(len(times_s)):
+        along = behind + speed * times_s[n]
+        if guided:
+            _bend(ahead_m, bend, along, there, slope)
+        left, up = start[0] + there[0], start[1] + there[1]
+        for a in range(3):
+            way = along * axes[0, a] + left * axes[1, a] + up * axes[2, a]
+            out[n, 2 * a] = position[a] + way
+            out[n, 2 * a + 1] = (
+                speed * axes[0, a] + speed * slope[0] * axes[1, a] + speed * slope[1] * axes[2, a]
+            )
+        out[n, 10] = heading_rad
+
+
+@compiled
+def _write_ways(
+    here: Here, slots: Array, speed_mps: float, pace: Array, ahead_m: Array, bend: Array, taut: Array,
+    loose: Array, reason: NDArray[np.int8], times_s: Array, origin: Array, axes: Array, heading_rad: float,
+    ways: Ways,
+) -> None:  # fmt: skip
+    """Write the ways of a guide; arrays of states come as zeros.
+
+    UAVs that hold have no taut way: theirs is the guide's, and none of it is loose.
+    """
+    room, level = np.zeros((5, 2)), np.zeros((len(ahead_m), 2))
+    spacing, last = ahead_m[1] - ahead_m[0], len(ahead_m) - 1
+    for run in range(pace.shape[0]):
+        for uav in range(pace.shape[1]):
+            position, place, sigma_m = here.position[run, uav], here.place[run, uav], here.sigma[run, uav]
+            behind, speed = here.behind[run, uav], speed_mps * pace[run, uav]
+            holds = reason[run, uav] >= HOLD
+            found, free, loosely = bend[run, uav], ways.free[run, uav], ways.loose[run, uav]
+            _write_one(
+                position, place, slots[uav], sigma_m, behind, speed, ahead_m, found, times_s, axes,
+                heading_rad, room, ways.way[run, uav],
+            )  # fmt: skip
+            _write_one(
+                position, place, slots[uav], sigma_m, behind, speed, ahead_m,
+                found if holds else taut[run, uav], times_s, axes, heading_rad, room, ways.pulled[run, uav],
+            )  # fmt: skip
+            _write_one(
+                position, place, slots[uav], sigma_m, behind, speed, ahead_m, level, times_s, axes,
+                heading_rad, room, free,
+            )  # fmt: skip
             for n in range(len(times_s)):
-                along = behind[run, uav] + speed * times_s[n]
-                if guided:
-                    _bend(ahead_m, bend[run, uav], along, there, slope)
-                left, up = start[0] + there[0], start[1] + there[1]
-                for a in range(3):
-                    way = along * axes[0, a] + left * axes[1, a] + up * axes[2, a]
-                    out[run, uav, n, 2 * a] = position[run, uav, a] + way
-                    out[run, uav, n, 2 * a + 1] = (
-                        speed * axes[0, a] + speed * slope[0] * axes[1, a] + speed * slope[1] * axes[2, a]
-                    )
-                out[run, uav, n, 10] = heading_rad
+                x, y, z = free[n, 0] - origin[0], free[n, 2] - origin[1], free[n, 4] - origin[2]
+                along = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2]
+                at = min(max((along - place[0]) / spacing, 0.0), float(last))
+                loosely[n] = 0.0 if holds else loose[run, uav, min(int(at), last - 1)]
 
 
 @compiled_bare

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from napf_mpc.quadratic_program import QpStatus
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 COUNTED = tuple(status for status in QpStatus if status is not QpStatus.SKIPPED)
 FALL_BACKS = ("tail", "hover", "descend")
@@ -58,7 +57,12 @@ class Tally:
     @classmethod
     def none(cls, runs: int) -> Tally:
         """Tally of a planner that solves nothing."""
-        return cls({name: np.zeros(runs, dtype=np.int64) for name in COLUMNS}, np.full(runs, np.nan))
+        return cls.over(np.zeros((len(COLUMNS), runs), dtype=np.int64))
+
+    @classmethod
+    def over(cls, counts: NDArray[np.int64]) -> Tally:
+        """Tally of counts (column, run) in the order of :data:`COLUMNS`: the same memory."""
+        return cls(dict(zip(COLUMNS, counts, strict=True)), np.full(counts.shape[1], np.nan))
 
     def columns(self) -> dict[str, NDArray[np.int64] | Array]:
         """Columns of ``runs.parquet``."""
@@ -75,7 +79,3 @@ class Tally:
             "cause": np.array([event.cause for event in events], dtype=np.str_),
             "action": np.array([event.action for event in events], dtype=np.str_),
         }
-
-    def add(self, name: str, uavs: Mask, amount: NDArray[np.int64] | int = 1) -> None:
-        """Count UAVs (run, uav), once each or by an amount (run, uav)."""
-        self.counts[name] += np.where(uavs, amount, 0).sum(-1)

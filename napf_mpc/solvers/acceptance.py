@@ -110,27 +110,24 @@ def refusals(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.int8]:
     array of int8, shape (run, uav)
         Codes of :class:`Refusal`.
     """
-    inside = np.empty(result.status.shape, dtype=np.bool_)
-    _inputs_inside(
-        result.inputs,
-        limits.input_matrix,
-        limits.input_lower - INPUT_TOLERANCE_N,
-        limits.input_upper + INPUT_TOLERANCE_N,
-        inside,
-    )
     finite = np.ones(result.status.shape, dtype=np.bool_)
+    z = plain(result.z)
     for values in (result.states, result.inputs, *result.slacks):
-        if values.size:
+        if values.size and not _is_part(values, result.z):
             _all_finite(values, finite)
-    balanced = np.empty(result.status.shape, dtype=np.bool_)
-    first = result.states.shape[-2] * STATES
-    _balanced(plain(result.y), first, plain(result.complementarity), limits.complementarity, balanced)
-    status, why = np.ascontiguousarray(result.status), np.empty(result.status.shape, dtype=np.int8)
+    why = np.empty(result.status.shape, dtype=np.int8)
     _judge(
-        status, finite, inside, plain(result.primal), plain(result.dual), balanced, limits.primal,
-        limits.dual, why,
+        np.ascontiguousarray(result.status), finite, z, plain(result.inputs), plain(result.y),
+        result.states.shape[-2] * STATES, plain(result.primal), plain(result.dual),
+        plain(result.complementarity), limits.input_matrix, limits.input_lower, limits.input_upper,
+        limits.primal, limits.dual, limits.complementarity, why,
     )  # fmt: skip
     return why
+
+
+def _is_part(values: Array, whole: Array) -> bool:
+    """Whether an array is a view of another, or both of the same."""
+    return values.base is whole or (whole.base is not None and values.base is whole.base)
 
 
 # Codes as plain numbers, for the compiled loop.
@@ -140,10 +137,14 @@ _NONE, _IS_SKIPPED, _BY_STATUS, _BY_NUMBERS, _BY_INPUT, _BY_PRIMAL, _BY_DUAL, _B
 
 @compiled_bare
 def _judge(
-    status: NDArray[np.int8], finite: Mask, inside: Mask, primal: Array, dual: Array, balanced: Mask,
-    most_primal: float, most_dual: float, why: NDArray[np.int8],
+    status: NDArray[np.int8], finite: Mask, z: Array, inputs: Array, y: Array, first: int, primal: Array,
+    dual: Array, complementarity: Array, matrix: Array, lower: Array, upper: Array, most_primal: float,
+    most_dual: float, most_product: float, why: NDArray[np.int8],
 ) -> None:  # fmt: skip
-    """Write the first test (run, uav) that fails; each must hold to pass, and NaN fails all of them."""
+    """Write the first test (run, uav) that fails; each must hold to pass, and NaN fails all of them.
+
+    Multipliers of the rows begin at ``first``; a mark of what is finite says nothing yet of z.
+    """
     for run in range(why.shape[0]):
         for uav in range(why.shape[1]):
             code = _NONE
@@ -151,32 +152,40 @@ def _judge(
                 code = _IS_SKIPPED
             elif status[run, uav] != _SOLVED:
                 code = _BY_STATUS
-            elif not finite[run, uav]:
+            elif not (finite[run, uav] and _is_finite(z, run, uav)):
                 code = _BY_NUMBERS
-            elif not inside[run, uav]:
+            elif not _inputs_inside(inputs, run, uav, matrix, lower, upper):
                 code = _BY_INPUT
             elif not primal[run, uav] <= most_primal:
                 code = _BY_PRIMAL
             elif not dual[run, uav] <= most_dual:
                 code = _BY_DUAL
-            elif not balanced[run, uav]:
+            elif not _balanced(y, run, uav, first, complementarity[run, uav], most_product):
                 code = _BY_PRODUCT
             why[run, uav] = code
 
 
 @compiled_bare
-def _inputs_inside(inputs: Array, matrix: Array, lower: Array, upper: Array, inside: Mask) -> None:
-    """Write whether all inputs (run, uav, N, 4) keep rows between bounds; NaN does not."""
-    for run in range(inputs.shape[0]):
-        for uav in range(inputs.shape[1]):
-            keeps = True
-            for k in range(inputs.shape[2]):
-                for i in range(len(lower)):
-                    value = 0.0
-                    for axis in range(inputs.shape[3]):
-                        value += matrix[i, axis] * inputs[run, uav, k, axis]
-                    keeps = keeps and lower[i] <= value <= upper[i]
-            inside[run, uav] = keeps
+def _is_finite(z: Array, run: int, uav: int) -> bool:
+    """Whether all numbers z[run, uav] are finite."""
+    lost = 0
+    for i in range(z.shape[2]):
+        # NaN fails every comparison.
+        lost += not abs(z[run, uav, i]) < np.inf
+    return lost == 0
+
+
+@compiled_bare
+def _inputs_inside(inputs: Array, run: int, uav: int, matrix: Array, lower: Array, upper: Array) -> bool:
+    """Whether all inputs [run, uav] (N, 4) keep rows within a tolerance of bounds; NaN does not."""
+    keeps = True
+    for k in range(inputs.shape[2]):
+        for i in range(len(lower)):
+            value = 0.0
+            for axis in range(inputs.shape[3]):
+                value += matrix[i, axis] * inputs[run, uav, k, axis]
+            keeps = keeps and lower[i] - INPUT_TOLERANCE_N <= value <= upper[i] + INPUT_TOLERANCE_N
+    return keeps
 
 
 @compiled_bare
@@ -191,21 +200,19 @@ def _all_finite(values: Array, finite: Mask) -> None:
 
 
 @compiled_bare
-def _balanced(y: Array, first: int, complementarity: Array, limit: float, balanced: Mask) -> None:
-    """Write whether complementarity (run, uav) is small beside the multipliers y (run, uav, m) of the rows.
+def _balanced(y: Array, run: int, uav: int, first: int, complementarity: float, limit: float) -> bool:
+    """Whether complementarity is small beside the multipliers y[run, uav] of the rows, which begin somewhere.
 
     A row that is off by what a row may be off costs its multiplier times that. NaN is never balanced.
     """
-    for run in range(y.shape[0]):
-        for uav in range(y.shape[1]):
-            missing = 0
-            for i in range(first, y.shape[2]):
-                missing += y[run, uav, i] != y[run, uav, i]
-            push = 0.0
-            if not complementarity[run, uav] <= limit:
-                for i in range(first, y.shape[2]):
-                    push = max(push, abs(y[run, uav, i]))
-            balanced[run, uav] = missing == 0 and complementarity[run, uav] <= limit + PRIMAL_LIMIT * push
+    missing = 0
+    for i in range(first, y.shape[2]):
+        missing += y[run, uav, i] != y[run, uav, i]
+    push = 0.0
+    if not complementarity <= limit:
+        for i in range(first, y.shape[2]):
+            push = max(push, abs(y[run, uav, i]))
+    return missing == 0 and complementarity <= limit + PRIMAL_LIMIT * push
 
 
 def accepted(result: BatchResult, limits: AcceptanceLimits) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.jit import compiled_bare
 from napf_mpc.qp import (
     INPUTS,
     STATES,
@@ -32,6 +33,7 @@ from napf_mpc.solvers.solver import (
     solve_safely,
     solver_names,
 )
+from napf_mpc.vehicle.plant import plain
 
 Mask = NDArray[np.bool_]
 STATUSES = tuple(QpStatus)
@@ -112,15 +114,32 @@ class BatchResult:
         WarmStart
             Cold for programs that were not solved.
         """
-        runs, uavs, stages = states.shape[:3]
-        z, x, u = np.empty_like(self.z), stages * STATES, stages * (STATES + INPUTS)
-        z[..., :x] = states.reshape(runs, uavs, x)
-        z[..., x:u] = inputs.reshape(runs, uavs, u - x)
-        z[..., u:] = self.z[..., u:]
-        cold = (self.status != STATUSES.index(QpStatus.SOLVED)) | ~np.isfinite(self.z[..., 0])
-        if cold.any():
-            z[cold] = np.nan
+        z = np.empty(self.z.shape)
+        _guess(plain(states), plain(inputs), plain(self.z), self.status, z)
         return WarmStart(z, self.y)
+
+
+_SOLVED = STATUSES.index(QpStatus.SOLVED)
+
+
+@compiled_bare
+def _guess(states: Array, inputs: Array, last: Array, status: NDArray[np.int8], z: Array) -> None:
+    """Write guesses (run, uav, n) of a plan with the slacks of the last answers; NaN for those not solved."""
+    stages = states.shape[2]
+    first, n = stages * (STATES + INPUTS), z.shape[2]
+    for run in range(z.shape[0]):
+        for uav in range(z.shape[1]):
+            if status[run, uav] != _SOLVED or not np.isfinite(last[run, uav, 0]):
+                for i in range(n):
+                    z[run, uav, i] = np.nan
+                continue
+            for k in range(stages):
+                for i in range(STATES):
+                    z[run, uav, k * STATES + i] = states[run, uav, k, i]
+                for i in range(INPUTS):
+                    z[run, uav, stages * STATES + k * INPUTS + i] = inputs[run, uav, k, i]
+            for i in range(first, n):
+                z[run, uav, i] = last[run, uav, i]
 
 
 class BatchSolver(Protocol):

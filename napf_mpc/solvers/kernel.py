@@ -8,6 +8,7 @@ by side with others', a scan of its rows where no known row is violated, and a c
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,8 +54,12 @@ class _Home:
     kept: Kept
     lanes: dict[int, Lanes]
     """By their number."""
+    single: Lanes
+    """For programs that are solved alone."""
     steady: dict[int, LinearRows]
     """Blocks that stand in the table for all programs, by their place in the horizon."""
+    outlines: list[Hashable]
+    """Of the blocks of the last horizon whose shapes have been looked at, and last its own shape."""
 
     @classmethod
     def of(cls, horizon: HorizonQp, maps: SignalMaps | None) -> _Home:
@@ -71,8 +76,25 @@ class _Home:
         return cls(
             horizon.model, layout, maps, RowPlaces.of(layout, maps.place), tuple(first),
             RowTable.empty(CHUNK, families, shelves, n), work, Room.empty(n, soft, len(work.row)),
-            Kept.empty(CHUNK, soft, len(work.row)), {1: Lanes.empty(n, 1)}, {},
+            Kept.empty(CHUNK, soft, len(work.row)), {}, Lanes.empty(n, 1), {}, [],
         )  # fmt: skip
+
+    def seen(self, horizon: HorizonQp) -> bool:
+        """Whether a horizon has the model and all shapes of one that has been looked at."""
+        if horizon.model is not self.model or len(horizon.rows) + 1 != len(self.outlines):
+            return False
+        if (horizon.initial.shape, horizon.reference.shape) != self.outlines[-1]:
+            return False
+        for n, block in enumerate(horizon.rows):
+            # A steady block that stands in the table is the very one whose shape was looked at.
+            if self.steady.get(n) is not block and block.outline() != self.outlines[n]:
+                return False
+        return True
+
+    def look_at(self, horizon: HorizonQp) -> None:
+        """Remember the shapes of a horizon that fits."""
+        self.outlines[:] = [block.outline() for block in horizon.rows]
+        self.outlines.append((horizon.initial.shape, horizon.reference.shape))
 
     def lanes_for(self, count: int) -> Lanes:
         """Room for so many programs side by side."""
@@ -154,7 +176,6 @@ class KernelSolver:
         QpError
             If shapes do not fit, the model is not sound, or its cost does not determine the inputs.
         """
-        horizon.check_shapes()
         home = self._fitting_home(horizon)
         layout, (runs, uavs, stages) = home.layout, horizon.shape
         batch, n, m = runs * uavs, layout.sparsity.variables, layout.sparsity.constraints
@@ -179,18 +200,22 @@ class KernelSolver:
                 gather(home.table, programs, family, shelf, step_s, *arrays)
             solve_programs(
                 home.maps, home.places, home.table, programs, home.work, home.room, home.kept,
-                home.lanes_for(len(programs)), home.lanes[1], initial, reference,
+                home.lanes_for(len(programs)), home.single, initial, reference,
                 guesses is not None, *guess, self._limit, z, y, residuals, ends, steps,
             )  # fmt: skip
         return _result(horizon, layout, z, y, residuals, ends, steps)
 
     def _fitting_home(self, horizon: HorizonQp) -> _Home:
         home = self._home
+        if home is not None and home.seen(horizon):
+            return home
+        horizon.check_shapes()
         if home is None or home.model is not horizon.model:
             horizon.model.check()
             home = _Home.of(horizon, None)
         elif not home.layout.same_rows(horizon):
             home = _Home.of(horizon, home.maps)
+        home.look_at(horizon)
         self._home = home
         return home
 

@@ -13,6 +13,7 @@ from napf_mpc.vehicle.derivative_generated import derivative
 from napf_mpc.vehicle.quadrotor import INPUTS, PARAMETERS, STATES
 
 Array = NDArray[np.float64]
+_DOUBLE = np.dtype(np.float64)
 
 
 def advance(
@@ -67,8 +68,8 @@ def advance(
 
 def plain(array: NDArray[np.generic]) -> Array:
     """Return the array as writeable C-contiguous float64, a copy only if it is not: one compiled variant."""
-    if array.dtype == np.float64 and array.flags.c_contiguous and array.flags.writeable:
-        return array.astype(np.float64, copy=False)
+    if array.flags.carray and array.dtype == _DOUBLE:
+        return array  # type: ignore[return-value]
     return np.array(array, dtype=np.float64, order="C")
 
 

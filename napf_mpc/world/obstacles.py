@@ -281,9 +281,9 @@ class ObstacleSet:
             width = largest_count(self.solids, self.tree, self.scene_start, array, reaches)
         else:
             width = limit
-        distance = np.full((*array.shape[:2], width), np.inf)
-        gradient = np.zeros((*array.shape[:2], width, 3))
-        index = np.full((*array.shape[:2], width), -1, dtype=np.int64)
+        distance = np.empty((*array.shape[:2], width))
+        gradient = np.empty((*array.shape[:2], width, 3))
+        index = np.empty((*array.shape[:2], width), dtype=np.int64)
         if width > 0:
             near_all(
                 self.solids, self.tree, self.scene_start, array, reaches, together, distance, gradient, index
@@ -315,6 +315,10 @@ def _finite(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
 
 
 def _spread(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    if isinstance(values, np.ndarray) and values.shape == shape and values.dtype == np.float64:
+        spread = np.ascontiguousarray(values)
+        if not np.isnan(spread).any():
+            return spread
     try:
         array = np.ascontiguousarray(np.broadcast_to(np.asarray(values, dtype=np.float64), shape))
     except ValueError:

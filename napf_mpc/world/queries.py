@@ -192,7 +192,7 @@ def near_all(
     gradient: NDArray[np.float64],
     index: NDArray[np.int64],
 ) -> None:
-    """Answer `ObstacleSet.near` in place; the arrays hold their padding and are at least one wide.
+    """Answer `ObstacleSet.near` in place, padding included; the arrays are at least one wide.
 
     So many points in a row as `together` says share a search, see :func:`_candidates`; it changes no answer.
     """
@@ -213,6 +213,11 @@ def near_all(
             if together > 1:
                 ours, theirs = points[r, start:stop], reaches[r, start:stop]
                 count = _candidates(solids, tree, scene, ours, theirs, nodes, centre, solid, from_centre)
+            for k in range(start, stop):
+                for n in range(width):
+                    distance[r, k, n], index[r, k, n] = np.inf, -1
+                    for axis in range(3):
+                        gradient[r, k, n, axis] = 0.0
             for k in range(start, stop if count >= 0 else start):
                 px, py, pz = points[r, k, 0], points[r, k, 1], points[r, k, 2]
                 reach = reaches[r, k]

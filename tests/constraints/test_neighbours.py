@@ -12,6 +12,7 @@ from napf_mpc.constraints.constraint import ConstraintError, Horizon
 from napf_mpc.constraints.contract import check_constraint, sample_horizon, sample_horizons
 from napf_mpc.constraints.neighbours import (
     NeighbourSeparation,
+    ShortMargins,
     margin_attainable,
     relative_covariance,
     slot_offsets,
@@ -197,6 +198,28 @@ def test_three_sigma_of_5_m_do_not_fit_into_a_square_of_10_m() -> None:
     attainable = margin_attainable(wide, sigma, np.zeros((7, 4, 3, 1)), inflation=Inflation(3.0))
     assert attainable.shape == (7, 4, 4)
     assert attainable.all()
+
+
+@pytest.mark.parametrize("reading", ["directional", "rms", "chi2", "largest"])
+def test_short_margins_are_those_that_a_pair_of_slots_has_no_room_for(reading: Any) -> None:
+    """Sigmas of 0.5 to 4.5 m in a square of 10 m; a UAV without trust does not count, and takes less room."""
+    square, inflation = (
+        problem(shape="square", side_m=10.0, first_lane_m=7.0),
+        Inflation(3.0, reading=reading),
+    )
+    rng = np.random.default_rng(5)
+    axes = rng.uniform(0.5, 4.5, (40, 4, 3))
+    covariance, factor = axes[..., None] ** 2 * np.eye(3), 0.5 * axes[..., None] * np.eye(3)
+    trusted = rng.random((40, 4)) < 0.8
+    known = trusted[..., None, None]
+    kept = margin_attainable(
+        square, np.where(known, covariance, 0.0), np.where(known, factor, 0.0), inflation=inflation
+    )
+    wanted = (trusted & ~kept.all(-1)).sum(-1)
+    counts = np.full(40, 7, dtype=np.int64)
+    ShortMargins(square, inflation).count(covariance, factor, trusted, counts)
+    np.testing.assert_array_equal(counts, 7 + wanted)
+    assert 0 < wanted.sum() < trusted.sum()
 
 
 @pytest.mark.parametrize(

@@ -326,7 +326,6 @@ def test_taut_ways_are_made_only_where_they_are_asked_for() -> None:
     guide = guidance([]).step(SLOTS[None], isotropic(0.5), np.ones((1, 4), dtype=bool), 0.0)
     assert guide.taut is None
     assert guide.loose is None
-    assert guide.pulled() is guide
 
 
 def test_settings_may_be_whole_numbers() -> None:

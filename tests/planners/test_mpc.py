@@ -480,6 +480,24 @@ def test_rows_that_do_not_fit_are_an_error_and_not_a_fall_back() -> None:
         planner.step(nav(on_slots(planner)), 0.0)
 
 
+def test_rows_that_fit_at_first_and_then_no_more_are_an_error_too() -> None:
+    class Shrinks:
+        name, steps = "shrinks", 0
+
+        def rows(self, horizon: Horizon) -> LinearRows:
+            self.steps += 1
+            stages = horizon.shape[2] - (self.steps > 2)
+            shape = (*horizon.shape[:2], stages, 1)
+            return LinearRows("position", np.zeros((*shape, 3)), np.full(shape, -np.inf))
+
+    planner = QpPlanner(problem(), constraints=[Shrinks()])
+    planner.reset(ObstacleSet.empty(), 1)
+    for time_s in (0.0, 0.1):
+        planner.step(nav(on_slots(planner)), time_s)
+    with pytest.raises(NapfError, match="constraint 'shrinks': jac has shape"):
+        planner.step(nav(on_slots(planner)), 0.2)
+
+
 def test_a_walk_to_a_goal_is_not_flown() -> None:
     with pytest.raises(ProblemError, match="formation"):
         QpPlanner(load_problem("single_uav"))

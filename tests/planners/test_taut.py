@@ -1,6 +1,7 @@
 """A guide's way pulled taut: to the margin and no farther, on the same side, and back in time."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import frame_of
+from napf_mpc.planners.references import SlotReference
 from napf_mpc.planners.taut import NEAR_M, SAME_M, STEPS, pulled_taut
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
@@ -158,13 +160,18 @@ def asked_everywhere(profile: Array, world: ObstacleSet, covariance: Array, k: f
 
 
 def test_uavs_that_hold_stay_on_the_guides_way() -> None:
+    """Guide 1 m to the left and up, its taut way on the lane; one UAV goes on along it, the other holds."""
     offset, taut = np.ones((1, 2, 5, 2)), np.zeros((1, 2, 5, 2))
     reason = np.array([[Passage.DETOUR, Passage.HOLD]], dtype=np.int8)
     guide = Guide(np.arange(5.0), offset, np.ones((1, 2)), reason, np.zeros((1, 2)), taut, np.ones((1, 2, 5)))
-    np.testing.assert_array_equal(guide.pulled().offset[0, 0], 0.0)
-    np.testing.assert_array_equal(guide.pulled().offset[0, 1], 1.0)
-    np.testing.assert_array_equal(guide.loose_at(np.ones((1, 2, 3)))[0, :, 0], [1.0, 0.0])
-    np.testing.assert_array_equal(guide.on_lanes().offset, 0.0)
-    plain = Guide(np.arange(5.0), offset, np.ones((1, 2)), reason, np.zeros((1, 2)))
-    assert plain.pulled() is plain
-    np.testing.assert_array_equal(plain.loose_at(np.ones((1, 2, 3))), 0.0)
+    slots = SlotReference(PATH, np.array([[0.0, 2.0, 0.0], [0.0, -2.0, 0.0]]), 2.0)
+    lanes = slots.offsets[None]
+    ways = slots.ways_from(slots.here(lanes), np.array([0.5, 1.0]), guide)
+    left = {name: getattr(ways, name)[0, :, -1, 2] - lanes[0, :, 1] for name in ("way", "pulled", "free")}
+    np.testing.assert_allclose(left["way"], [1.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(left["pulled"], [0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(left["free"], [0.0, 0.0], atol=1e-12)
+    np.testing.assert_array_equal(ways.loose[0, :, -1], [1.0, 0.0])
+    # Each is what a guide of that way alone leads along.
+    alone = slots.over_from(slots.here(lanes), np.array([0.5, 1.0]), replace(guide, taut=None, loose=None))
+    np.testing.assert_array_equal(ways.way, alone)

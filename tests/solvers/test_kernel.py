@@ -317,6 +317,31 @@ def test_an_answer_depends_on_its_own_numbers_and_guess_alone() -> None:
         warm = whole.warm_start(whole.states, whole.inputs)
 
 
+def test_shapes_that_change_from_step_to_step_are_noticed() -> None:
+    """More rows, other kinds and another number of UAVs are looked at anew; what does not fit is refused."""
+    solver = make_batch_solver("kernel")
+    horizon = mixed(1, 2, 2)
+    first, *others = horizon.rows
+
+    def begin(values: Array | None) -> Array | None:
+        return None if values is None else values[..., :1]
+
+    few = replace(
+        first, jac=first.jac[:, :, :, :1], lower=begin(first.lower), upper=begin(first.upper),
+        w1=begin(first.w1), w2=begin(first.w2),
+    )  # fmt: skip
+    for other in (horizon, replace(horizon, rows=(few, *others)), horizon.of_one(1, 0), horizon):
+        fresh = make_batch_solver("kernel").solve_batch(other)
+        np.testing.assert_array_equal(solver.solve_batch(other).z, fresh.z)
+    for broken in (
+        replace(horizon, initial=horizon.initial[:1]),
+        replace(horizon, reference=horizon.reference[:, :1]),
+        replace(horizon, rows=(replace(first, jac=first.jac[:, :, 1:]), *others)),
+    ):
+        with pytest.raises(QpError, match="has shape"):
+            solver.solve_batch(broken)
+
+
 def test_guesses_of_any_quality_lead_to_the_same_answer() -> None:
     rng = np.random.default_rng(0)
     for seed in range(6):
