@@ -12,7 +12,7 @@ from napf_mpc.quadratic_program import Array, QpStatus, QuadraticProgram
 from napf_mpc.solvers.solver import SolverError, make_solver
 
 pytest.importorskip("piqp")
-from napf_mpc.solvers import piqp_  # noqa: E402 - only where PIQP is
+from napf_mpc.solvers import piqp_
 
 
 def nearest_to(lower: list[float], upper: list[float]) -> QuadraticProgram:
