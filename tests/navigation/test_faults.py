@@ -18,6 +18,7 @@ RULES = {
     "negative": "gate",
     "asymmetric": "gate",
     "jump": "gate",
+    "jump_stays": "gate",
     "stuck": "gate",
     "back": "gate",
     "slow": "missed",
