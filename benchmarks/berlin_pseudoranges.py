@@ -123,7 +123,7 @@ def levels(ranges: Array, truth: Array, p_hmi: float, reported: bool) -> tuple[A
 def level_row(words: str, found: tuple[Array, Array, Array]) -> str:
     """How often there is a level, and how often it is true, beside 3 sigma of the same position."""
     error, level, covariance = found
-    known = np.isfinite(level).all(-1)
+    known = np.asarray(np.isfinite(level).all(-1))
     if not known.any():
         return f"| {words} | 0 of {len(known)} | | | | | |"
     error, level, covariance = error[known], level[known], covariance[known]

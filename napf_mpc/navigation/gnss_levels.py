@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +12,6 @@ from napf_mpc.navigation.pseudorange_solution import PseudorangeSolution, Solver
 __all__ = ["TRUSTED", "levels_of", "with_levels"]
 
 Array = NDArray[np.float64]
-Values = TypeVar("Values", bound=NDArray[Any])
 
 TRUSTED = 0.1
 """Signals that are likelier than this to be faulty are left out before."""
@@ -59,18 +56,16 @@ def with_levels(
         SolverSettings("plain", exclude=False, max_pdop=np.inf),
     )
 
-    def chosen(new: Values, old: Values) -> Values:
-        return np.where(known.reshape(-1, *[1] * (new.ndim - 1)), new, old).astype(old.dtype)
-
+    one, two = known[:, None], known[:, None, None]
     return PseudorangeSolution(
-        chosen(plain.offset, found.offset),
-        chosen(plain.clock, found.clock),
-        chosen(plain.covariance, found.covariance),
-        chosen(plain.gain, found.gain),
-        chosen(plain.used, found.used),
-        chosen(plain.check, found.check),
-        chosen(plain.dop, found.dop),
-        chosen(plain.excess, found.excess),
+        np.where(one, plain.offset, found.offset),
+        np.where(one, plain.clock, found.clock),
+        np.where(two, plain.covariance, found.covariance),
+        np.where(two, plain.gain, found.gain),
+        np.where(one, plain.used, found.used),
+        np.where(known, plain.check, found.check),
+        np.where(one, plain.dop, found.dop),
+        np.where(known, plain.excess, found.excess),
     )
 
 

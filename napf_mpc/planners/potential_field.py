@@ -142,8 +142,13 @@ class PotentialFieldPlanner:
         return force, np.asarray((rho < influence).any(-1))
 
     def _move_anchors(self, nav: NavSolution, trusted: NDArray[np.bool_]) -> None:
-        """Note the last trusted place of each UAV; until there is one, the first that is a number."""
-        known = trusted | (~self._placed & np.isfinite(nav.position).all(-1))
+        """Note the last trusted place of each UAV; until there is one, the first that is a number.
+
+        A fix without a protection level may be any distance off, and a UAV that held its place by it would
+        be moved by that: it follows the fix, and holds by its velocity.
+        """
+        follows = self.inflation.safety == "protection_level"
+        known = trusted | ((~self._placed | follows) & np.isfinite(nav.position).all(-1))
         self._anchor = np.where(known[..., None], nav.position, self._anchor)
         self._placed |= known
 

@@ -32,7 +32,7 @@ class _NavigationBase(Section):
     innovation_gate_sigma: float = Field(5.0, ge=0.0, le=100.0)
     """Filter: a fix farther than this many sigmas from what is expected is refused; 0 for no gate."""
     monitor: Literal["none", "innovations"] = "none"
-    """Filter: whether its normalised innovations are watched and reported sigmas that are too small scaled (docs/integrity.md)."""  # noqa: E501
+    """Filter: whether its normalised innovations are watched, reported sigmas that are too small scaled, and fixes that contradict the estimate held out while the UAV holds (docs/integrity.md)."""  # noqa: E501
     filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
     """Filter: correlation time that it assumes of the fix's error; by default the error's own."""
     filter_coast_sigma_m: float = Field(10.0, ge=1e-3, le=1e4)
