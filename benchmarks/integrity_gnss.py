@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 K = 3.0
 ALERT_LIMITS_M = (40.0, 50.0)
 """Of the approach APV-I, for want of one for UAVs."""
-FAR_M = 900.0
+FAR_M = 400.0
 """Larger levels are drawn here [m]."""
 
 
@@ -174,7 +174,7 @@ def main() -> None:
     print(f"\n{first.level_ms:.3f} ms a level; {count:.0f} satellites in it")
     if chosen.out is not None:
         usual = np.where(np.isnan(first.usual_error), np.inf, first.usual_level)
-        # Levels of many kilometres say the same as one: not here.
+        # Levels of kilometres would take the room of those that matter.
         level = np.where(np.isfinite(first.level), np.minimum(first.level, FAR_M), np.inf)
         sources = (("3 reported sigmas", first.usual_error, usual), ("protection level", first.error, level))
         panels = [

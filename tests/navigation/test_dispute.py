@@ -18,10 +18,15 @@ def north(metres: float) -> np.ndarray:
 
 
 class Flown:
-    """A UAV at 2 m/s whose fixes are true but for what is added; sigma 1 m, one step and fix every 0.1 s."""
+    """A UAV at 2 m/s whose fixes are true but for what is added; one step and fix every 0.1 s."""
 
     def __init__(
-        self, seconds: float, position: Offset, velocity: Offset | None = None, monitor: str = "innovations"
+        self,
+        seconds: float,
+        position: Offset,
+        velocity: Offset | None = None,
+        monitor: str = "innovations",
+        sigma_m: float = 1.0,
     ) -> None:
         navigation = GaussMarkov.model_validate({"filter": "kalman", "monitor": monitor})
         self.filter = KalmanFilter(FilterModel.of_navigation(navigation, PERIOD_S, 1), 1, 1)
@@ -33,7 +38,7 @@ class Flown:
                 self.filter.predict(np.zeros((1, 1, 3)), one)
             place = (SPEED * t + position(t)).reshape(1, 1, 3)
             speed = (SPEED + (velocity(t) if velocity else 0.0)).reshape(1, 1, 3)
-            self.filter.correct(place, speed, np.eye(3)[None, None], all_of, True, one)
+            self.filter.correct(place, speed, sigma_m**2 * np.eye(3)[None, None], all_of, True, one)
             nav = self.filter.solution(t, np.zeros((1, 1, 3)), np.zeros((1, 1, 3)))
             self.time_s.append(t)
             self.error.append(float(np.linalg.norm(nav.position[0, 0] - SPEED * t)))
@@ -53,8 +58,10 @@ def jump(metres: float, begin_s: float = 10.0, end_s: float = 1e9) -> Offset:
     return lambda t: north(metres if begin_s <= t < end_s else 0.0)
 
 
-def test_a_jump_is_held_out_and_the_uav_holds_until_it_is_undone() -> None:
-    flown = Flown(45.0, jump(10.0, 10.0, 30.0))
+@pytest.mark.parametrize("sigma_m", [1.0, 2.5])
+def test_a_jump_is_held_out_and_the_uav_holds_until_it_is_undone(sigma_m: float) -> None:
+    """Also where 10 m are a possible error, four sigmas: what counts is that it came at once."""
+    flown = Flown(45.0, jump(10.0, 10.0, 30.0), sigma_m=sigma_m)
     assert max(flown.error) < 0.1  # none of the 10 m
     assert flown.turns == [(12.9, "begins"), (30.0, "ends")]
     held = [t for t, there in zip(flown.time_s, flown.available, strict=True) if not there]
