@@ -14,7 +14,7 @@ from napf_mpc import store
 from napf_mpc.closed_loop import Scenario, build_scenario, closed_loop
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
-from napf_mpc.navigation.monitor import MonitorEvent
+from napf_mpc.navigation.monitor import DoubtEvent, MonitorEvent
 from napf_mpc.planners.planner import Planner, tally_of
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.planners.tally import Event, Tally
@@ -166,9 +166,10 @@ def _fly(problem: Problem, planner: Planner, scenario: Scenario, record_every: i
     flight = closed_loop(problem, planner, scenario, (judge,) if recorder is None else (judge, recorder))
     track = {} if recorder is None else recorder.columns()
     tally = tally_of(planner, len(scenario.runs))
-    if flight.monitor is not None and flight.monitor.events:
+    if flight.monitor is not None:
         # A copy: the planner keeps its own list.
-        tally = replace(tally, events=[*tally.events, *map(_event, flight.monitor.events)])
+        told = [*map(_event, flight.monitor.events), *map(_doubt, flight.monitor.doubts)]
+        tally = replace(tally, events=[*tally.events, *told])
     return Missions(judge.score(flight), scenario, track, tally)
 
 
@@ -181,6 +182,17 @@ def _event(alarm: MonitorEvent) -> Event:
         f"reported sigma {axis} too small for its innovations",
         f"sigma {axis} x {alarm.sigma_scale:.3g}",
     )
+
+
+_TURNS = {
+    "begins": ("fixes disagree with the estimate", "hold"),
+    "ends": ("fixes agree with the estimate again", "fly on"),
+    "given in": ("fixes disagree, and the estimate is worth nothing", "begin anew with the fix"),
+}
+
+
+def _doubt(doubt: DoubtEvent) -> Event:
+    return Event(doubt.time_s, doubt.run, doubt.uav, *_TURNS[doubt.turn])
 
 
 def score_rows(planner: str, seed: int, score: Score, tally: Tally | None = None) -> store.Columns:

@@ -206,14 +206,17 @@ class LevelErrors:
 
     level_m: tuple[float, float]
     lost_from: int = 10**9
+    lost_error_m: float = 0.0
     period_s: float = 0.1
 
     def fix(self, epoch: int) -> Fix:
         level = np.tile(np.array(self.level_m), (1, 4, 1))
+        error = np.zeros((1, 4, 3))
         if epoch >= self.lost_from:
             level[:, 0] = np.nan
+            error[:, 0, 2] = self.lost_error_m
         return Fix(
-            error=np.zeros((1, 4, 3)),
+            error=error,
             covariance=np.tile(0.01 * np.eye(3), (1, 4, 1, 1)),
             common_factor=np.zeros((1, 4, 3, 1)),
             available=np.ones((1, 4), dtype=bool),
@@ -251,6 +254,29 @@ def test_a_uav_without_a_level_holds(tmp_path: Path, planner: str) -> None:
     levels = problem(tmp_path, 'planner.safety="protection_level"', "simulation.time_limit_s=12")
     _, held = clearance(levels, planner, LevelErrors((3.0, 3.0), lost_from=80))
     assert held
+
+
+class Highest:
+    """How far the first UAV leaves its height."""
+
+    off_m = 0.0
+
+    def moved(self, time_s: float, before: np.ndarray, after: np.ndarray, active: np.ndarray) -> None:
+        self.off_m = max(self.off_m, float(np.abs(after[0, 0, 4] - before[0, 0, 4])), abs(after[0, 0, 4]))
+
+    def ticked(self, *seen: object) -> None:
+        pass
+
+
+@pytest.mark.parametrize("planner", ["napf", "qp"])
+def test_a_fix_without_a_level_does_not_move_a_uav_that_holds(tmp_path: Path, planner: str) -> None:
+    """It jumps up by 20 m as the level is lost; holding the last place by it would go down as far."""
+    task = problem(tmp_path, 'planner.safety="protection_level"', "simulation.time_limit_s=14")
+    errors = LevelErrors((3.0, 3.0), lost_from=80, lost_error_m=20.0)
+    seen = Highest()
+    scenario = replace(build_scenario(task, 0, range(1)), errors=errors)
+    closed_loop(task, make_planner(planner, task), scenario, [seen])
+    assert seen.off_m < 4.0  # the height of the others' avoidance, not of the fix
 
 
 def test_apf_flies_the_same_whatever_drives_the_others(tmp_path: Path) -> None:

@@ -11,6 +11,20 @@ that accelerometers measured. It takes as known
 - the common-mode share, for what it reports of two UAVs. (What emulated receivers have in common lasts for
   the mission and is kept out of the filter, see :mod:`napf_mpc.navigation.filtered`.)
 
+With the monitor, fixes that the gate refuses are handled by these rules; position and velocity of a receiver
+are two witnesses, and one of them may be right when the other is not.
+
+1. A fix refused for its position leaves its velocity, if that is inside the gate.
+2. A fix that stands still to a millimetre while its velocity says that the UAV moves is refused.
+3. A fix that follows a refused one (the step between them is inside the gate) is refused as well, unless it
+   is within :data:`~napf_mpc.navigation.kalman.PULL` sigmas of the estimate.
+4. After :data:`GATE_PATIENCE_S` of refused fixes, fixes and estimate are in dispute. The solution does not
+   count as available, so the UAV holds: that it does not move both stories say. What was known of the fix's
+   error is forgotten.
+5. The dispute ends with a step that brings the fix inside the gate, or once fixes have been within
+   :data:`CALM_SIGMAS` for :data:`CALM_S`. If the estimate's own sigma passes ``filter_coast_sigma_m`` first,
+   the filter begins anew with the fix, its sigma at least their distance.
+
 The axes are filtered apart. Where a fix reports a covariance between axes, that is not used to estimate, but
 carried through the gains that are, so the reported covariance has it.
 """
@@ -43,7 +57,12 @@ There is none in the simulated fixes. It covers the trapezoidal rule of the pred
 the arithmetic sound where an error never changes, so that two fixes would tell the velocity exactly.
 """
 GATE_PATIENCE_S = 3.0
-"""Time of refused fixes without one used in between [s], after which the next starts the filter anew."""
+"""Time of refused fixes without one used in between [s], after which the next starts the filter anew; with
+the monitor, after which they are in doubt."""
+CALM_S, CALM_SIGMAS = 30.0, 3.0
+"""Doubted fixes that stay this near to the estimate, in sigmas of both, for this long [s] are used again."""
+REPEATED_SIGMAS = 5.0
+"""A velocity beyond this many of its sigmas says that a UAV moves."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +162,7 @@ class KalmanFilter:
 
     Each begins with the first fix that it is given, at t = 0 also with one that is carried on from before:
     position = fix, with the reported sigma; velocity = GNSS velocity; bias zero, with its sigma. After
-    :data:`GATE_PATIENCE_S` of fixes that the gate refused it does so again.
+    :data:`GATE_PATIENCE_S` of fixes that the gate refused it does so again, but for the monitor's rules.
 
     Parameters
     ----------
@@ -167,6 +186,12 @@ class KalmanFilter:
         self._sigma = np.full((runs, uavs, 3), np.nan)
         self._epochs_since_new, self._epochs_per_new = 0, 1
         self._monitor = InnovationMonitor(runs, uavs) if model.monitored else None
+        self._doubted = np.zeros((runs, uavs), dtype=np.bool_)
+        self._refused_miss = np.full((runs, uavs, 3), np.nan)
+        self._calm_s = np.zeros((runs, uavs))
+        self._follows = np.zeros((runs, uavs), dtype=np.bool_)
+        self._barred = np.zeros((runs, uavs), dtype=np.bool_)
+        self._last_position = np.full((runs, uavs, 3), np.nan)
         self._epoch = 0
 
         shared = bool(model.common_share.any()) and 1 < uavs <= cross_covariance.MAX_UAVS
@@ -246,10 +271,11 @@ class KalmanFilter:
         sound = is_symmetric(covariance)
         if not sound.all():
             sigma = np.where(sound[..., None], sigma, np.nan)
-        begins = ~self._begun | (self._refused_s >= GATE_PATIENCE_S - 1e-9)
+        begins = ~self._begun | self._gives_in()
         first = not self._begun.any()
         has_fix = (available | first) & (new | first)
         if self._monitor is not None:
+            self._bar_repeated(position, velocity)
             sigma, covariance = self._watched(position, sigma, covariance, has_fix, begins, active)
         self._epoch += 1
         self._missed_fixes += new & ~available & active[:, None]
@@ -268,6 +294,10 @@ class KalmanFilter:
             model.velocity_sigma_mps**2,
             model.bias_sigma_mps2**2,
             model.gate,
+            self._doubted,
+            self._follows,
+            self._barred,
+            model.monitored,
             begins,
             active,
             self._verdict,
@@ -281,7 +311,28 @@ class KalmanFilter:
             self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
         usable = np.isfinite(position) & np.isfinite(velocity) & np.isfinite(sigma) & (sigma > 0.0)
         self._note_verdict(available, np.asarray(usable.all(-1)), active)
+        if self._monitor is not None:
+            self._note_doubts(position, usable, sigma)
         self._advance_covariances(covariance, sigma, active)
+
+    def _gives_in(self) -> Mask:
+        """(run, uav): who begins anew with the next fix, after many that the gate refused.
+
+        Unwatched, after its patience. With the monitor only when the estimate has become worth nothing.
+        """
+        late = self._refused_s >= GATE_PATIENCE_S - 1e-9
+        if self._monitor is None:
+            return late
+        return np.asarray(late & ~(self._packed[..., 0].max(-1) <= self._model.coast_sigma_m**2))
+
+    def _bar_repeated(self, position: Array, velocity: Array) -> None:
+        """Refuse fixes that stand still while their own velocity says that the UAV moves."""
+        model = self._model
+        with np.errstate(invalid="ignore"):
+            still = (np.abs(position - self._last_position) <= RECEIVER_NOISE_M).all(-1)
+            moves = (np.abs(velocity) > REPEATED_SIGMAS * model.velocity_sigma_mps).any(-1)
+        self._barred = still & moves
+        self._last_position = position.copy()
 
     def _watched(
         self, position: Array, sigma: Array, covariance: Array, has_fix: Mask, begins: Mask, active: Mask
@@ -300,8 +351,11 @@ class KalmanFilter:
         squared = np.empty(sigma.shape)
         squared_innovations(
             self._mean, self._packed, position, sigma * np.sqrt(monitor.scale), measured,
-            model.error_memory, model.error_noise, RECEIVER_NOISE_M**2, squared,
+            model.error_memory, model.error_noise, RECEIVER_NOISE_M**2, self._refused_miss, squared,
         )  # fmt: skip
+        stepped = (squared > model.gate**2).any(-1)
+        calm = self._calm_s >= CALM_S - 1e-9
+        self._follows = np.isfinite(self._refused_miss).all(-1) & ~stepped & ~calm
         change = monitor.observe(squared, time_s)
         if (change != 1.0).any():
             kalman.rescale(self._mean, self._packed, change)
@@ -323,6 +377,19 @@ class KalmanFilter:
         waiting = available & usable & ~self._used & flying
         epoch_s = self._model.period_s * self._model.ticks_per_epoch
         self._refused_s = np.where(self._used, 0.0, self._refused_s + epoch_s * waiting)
+
+    def _note_doubts(self, position: Array, usable: Mask, sigma: Array) -> None:
+        """Say whose fixes have been refused for long, and keep what refused ones were off."""
+        assert self._monitor is not None
+        refused = (self._verdict == kalman.REFUSED)[..., None] & usable
+        self._refused_miss = np.where(refused, position - self._mean[..., 0], np.nan)
+        self._doubted = self._begun & (self._refused_s >= GATE_PATIENCE_S - 1e-9)
+        spread = CALM_SIGMAS**2 * (self._packed[..., 0] + sigma**2)
+        near = (self._refused_miss**2 <= spread).all(-1)
+        epoch_s = self._model.ticks_per_epoch * self._model.period_s
+        self._calm_s = np.where(self._doubted & near, self._calm_s + epoch_s, 0.0)
+        time_s = (self._epoch - 1) * epoch_s
+        self._monitor.doubt(self._doubted, self._verdict == kalman.BEGUN, time_s)
 
     def _advance_covariances(self, covariance: Array, sigma: Array, active: Mask) -> None:
         if len(self._common):
@@ -362,13 +429,14 @@ class KalmanFilter:
             cross_covariance.report_axes(self._cross, self._since[self._age], covariance)
         return NavSolution(
             time_s=time_s,
-            available=self._used | (widest <= self._model.coast_sigma_m**2),
+            available=(self._used | (widest <= self._model.coast_sigma_m**2)) & ~self._doubted,
             position=position,
             velocity=velocity,
             attitude=attitude,
             body_rates=body_rates,
             covariance=covariance,
             common_factor=self._common_factor,
+            disputed=None if self._monitor is None else self._doubted,
             filtered=True,
             forecast=CovarianceForecast(
                 self._forecast,

@@ -39,6 +39,7 @@ from napf_mpc.navigation.range_errors import (
     code_noise_sigma_m,
     multipath_sigma_m,
     obliquity,
+    p_reflected,
     troposphere_mapping,
 )
 from napf_mpc.navigation.rinex import gps_seconds, read_rinex_navigation
@@ -171,16 +172,38 @@ class GnssScene:
         carrier_to_noise : array, shape (run, uav, sat)
             [dB Hz].
         """
+        reflection = code_noise_sigma_m(carrier_to_noise, self.config.believed_reflection_m)
+        return np.asarray(np.sqrt(self._sight_variance(unit, carrier_to_noise) + reflection**2))
+
+    def sight_sigma(self, unit: Array, carrier_to_noise: Array) -> Array:
+        """Sigma of ranges (run, uav, sat) if their signals are in sight [m]; arguments as before."""
+        return np.asarray(np.sqrt(self._sight_variance(unit, carrier_to_noise)))
+
+    def p_reflected(self, unit: Array, carrier_to_noise: Array) -> Array:
+        """Probability (run, uav, sat) that signals arrive by reflection alone, by their C/N0 and elevation.
+
+        Before its strength is known, ``prior_reflected`` for one on the horizon, which falls with the angle
+        to none in the zenith; the rest are the laws of C/N0.
+        """
         cfg = self.config
-        elevation = np.maximum(elevation_rad(unit), math.radians(cfg.elevation_mask_deg))
+        low, high = cfg.carrier_to_noise_dbhz
+        elevation = self._elevation(unit)
+        expected = carrier_to_noise_dbhz(elevation, low, high)[:, None]
+        return p_reflected(
+            carrier_to_noise - expected, cfg.fading_db, cfg.reflected_loss_db, cfg.reflected_loss_sigma_db,
+            cfg.prior_reflected * np.maximum(1.0 - elevation / (0.5 * math.pi), 0.0)[:, None],
+        )  # fmt: skip
+
+    def _elevation(self, unit: Array) -> Array:
+        """Elevation (run, sat) of satellites, of those under the mask its own [rad]."""
+        return np.maximum(elevation_rad(unit), math.radians(self.config.elevation_mask_deg))
+
+    def _sight_variance(self, unit: Array, carrier_to_noise: Array) -> Array:
+        elevation = self._elevation(unit)
         shared = _length(self._shared_parts(elevation))
-        multipath = cfg.multipath_scale * multipath_sigma_m(elevation)
-        variance = (
-            (shared**2 + multipath**2)[:, None]
-            + code_noise_sigma_m(carrier_to_noise, cfg.code_noise_m) ** 2
-            + code_noise_sigma_m(carrier_to_noise, cfg.believed_reflection_m) ** 2
-        )
-        return np.asarray(np.sqrt(variance))
+        multipath = self.config.multipath_scale * multipath_sigma_m(elevation)
+        noise = code_noise_sigma_m(carrier_to_noise, self.config.code_noise_m)
+        return np.asarray((shared**2 + multipath**2)[:, None] + noise**2)
 
     def _shared_parts(self, elevation: Array) -> Array:
         """Sigmas (run, sat, 3) of what all UAVs have in common: signal in space, ionosphere, troposphere."""

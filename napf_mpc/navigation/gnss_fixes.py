@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.navigation.fix import Fix, coasting_variance
 from napf_mpc.navigation.gnss import GnssScene, Observation
+from napf_mpc.navigation.gnss_levels import levels_of, with_levels
 from napf_mpc.navigation.pseudorange_solution import Check, PseudorangeSolution, SolverSettings, solve
 from napf_mpc.problem import Gnss
 from napf_mpc.streams import NormalRows, Seed, Stream
@@ -123,6 +124,11 @@ class GnssFixes:
         observed = scene.observe(time_s, position, noise)
         found = solve_observation(observed, scene, self._settings)
         shape = self._error.shape[:2]
+        protection = None
+        if cfg.integrity == "araim":
+            levels = levels_of(observed, scene)
+            found = with_levels(found, levels, observed, scene)
+            protection = cfg.reported_sigma_scale * levels.level_m.reshape(*shape, 2)
         self.check = found.check.reshape(shape)
         available = self.check != Check.NONE
         if epoch == 0 and not available.all():
@@ -145,4 +151,5 @@ class GnssFixes:
             covariance=cfg.reported_sigma_scale**2 * covariance,
             common_factor=cfg.reported_sigma_scale * factor,
             available=available,
+            protection=protection,
         )

@@ -27,6 +27,8 @@ PACKED = 10
 
 NO_FIX, USED, BEGUN, REFUSED = 0, 1, 2, -1
 """What :func:`correct` made of a fix."""
+PULL = 2.0
+"""Distance in the estimate's own sigmas up to which a fix moves it no more than it claims to know."""
 
 
 def drift(period_s: float, bias_memory: float) -> Array:
@@ -110,6 +112,10 @@ def correct(
     velocity_noise: float,
     bias_variance: float,
     gate: float,
+    doubted: Mask,
+    follows: Mask,
+    barred: Mask,
+    speed_alone: bool,
     restart: Mask,
     active: Mask,
     verdict: NDArray[np.int8],
@@ -118,8 +124,9 @@ def correct(
 ) -> None:
     """Take in one epoch of fixes, in place.
 
-    A fix is used as a whole or not at all. It is refused if one of its numbers is not finite, if a sigma is
-    not positive (unknown, not certain), or if an innovation leaves ``gate`` of its own sigmas.
+    A fix is used as a whole or not at all, but for ``speed_alone``. It is refused if one of its numbers is
+    not finite, if a sigma is not positive (unknown, not certain), or if an innovation leaves ``gate`` of its
+    own sigmas.
 
     Parameters
     ----------
@@ -139,6 +146,15 @@ def correct(
         Variance of an accelerometer bias of which nothing is known [m^2/s^4].
     gate : float
         Largest innovation in its sigmas; 0 for none.
+    doubted : array of bool, shape (run, uav)
+        UAVs whose fixes have disagreed for long: what was known of their error counts no more.
+    follows : array of bool, shape (run, uav)
+        Fixes that say no more than the refused one before: refused as well if they are doubted, or farther
+        from the estimate than :data:`PULL` of its own sigmas.
+    barred : array of bool, shape (run, uav)
+        Fixes that are refused whatever they say.
+    speed_alone : bool
+        Whether a fix refused for its position leaves its velocity, if that is inside its gate on all axes.
     restart : array of bool, shape (run, uav)
         UAVs that forget all they knew and begin with this fix, if it can be used.
     active : array of bool, shape (run,)
@@ -158,17 +174,27 @@ def correct(
         for i in range(mean.shape[1]):
             fresh, begins = has_fix[r, i], restart[r, i]
             usable = True
+            witness = speed_alone and fresh and not begins
             for a in range(3):
                 x, c = mean[r, i, a], packed[r, i, a]
-                _forget(x, c, error_memory[a], error_noise[a])
+                memory = 0.0 if doubted[r, i] else error_memory[a]
+                noise = 1.0 if doubted[r, i] else error_noise[a]
+                _forget(x, c, memory, noise)
                 if keep:
-                    _forget_carried(carried[r, i, a], response[r, i, a], error_memory[a], error_noise[a])
+                    _forget_carried(carried[r, i, a], response[r, i, a], memory, noise)
                 if fresh:
                     place, speed, sigma = fix_position[r, i, a], fix_velocity[r, i, a], fix_sigma[r, i, a]
-                    usable &= _is_measured(place, sigma) and np.isfinite(speed)
+                    measured = _is_measured(place, sigma) and np.isfinite(speed)
+                    usable &= measured
+                    witness &= measured
                     if not begins:
-                        usable &= _position_inside(x, c, place, sigma, position_noise, gate)
-                        usable &= _inside(speed - x[1], c[4] + velocity_noise, gate)
+                        steady = _inside(speed - x[1], c[4] + velocity_noise, gate)
+                        usable &= _position_inside(x, c, place, sigma, position_noise, gate) and steady
+                        usable &= not barred[r, i]
+                        if follows[r, i]:
+                            near = _inside(place - x[0] - sigma * x[2], c[0], PULL)
+                            usable &= near and not doubted[r, i]
+                        witness &= steady
             verdict[r, i] = NO_FIX
             if fresh:
                 verdict[r, i] = REFUSED if not usable else BEGUN if begins else USED
@@ -184,12 +210,14 @@ def correct(
                     continue
                 alone = not fresh and fixless_axis[a] and _is_measured(place, sigma)
                 alone = alone and _position_inside(x, c, place, sigma, position_noise, gate)
-                if not (alone or verdict[r, i] == USED):
+                spoken = witness and verdict[r, i] == REFUSED
+                if not (alone or spoken or verdict[r, i] == USED):
                     continue
                 _unpack(c, full)
-                _take_in(x, full, k, place, 1.0, 0.0, sigma, position_noise)
-                if keep:
-                    _take_in_carried(carried[r, i, a], response[r, i, a], k, 1.0, 0.0, sigma)
+                if not spoken:
+                    _take_in(x, full, k, place, 1.0, 0.0, sigma, position_noise)
+                    if keep:
+                        _take_in_carried(carried[r, i, a], response[r, i, a], k, 1.0, 0.0, sigma)
                 if not alone:
                     _take_in(x, full, k, speed, 0.0, 1.0, 0.0, velocity_noise)
                     if keep:

@@ -8,20 +8,32 @@ reported sigma is taken as too small: its square grows by the median of the squa
 the chi-square law, 0.455. Counts and medians, not means: one wild fix is the gate's affair. The scale falls
 again where the median of :data:`WINDOW` innovations is less than half of what it should be, never below 1.
 Where the filter begins anew with a fix that it had refused, the sigma is then at least their distance. As
-long as no alarm is raised, nothing is changed to the last bit.
+long as no alarm is raised and no fix refused, nothing is changed to the last bit.
+
+A fix after a refused one is compared with that one, carried on by the estimate: a jump counts once, however
+long it lasts, and sigmas that are too small count as before. What else a refused fix means with the monitor
+is in :mod:`napf_mpc.navigation.filter`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
 
-__all__ = ["ALARM_HITS", "HIT", "WINDOW", "InnovationMonitor", "MonitorEvent", "squared_innovations"]
+__all__ = [
+    "ALARM_HITS",
+    "HIT",
+    "WINDOW",
+    "DoubtEvent",
+    "InnovationMonitor",
+    "MonitorEvent",
+    "squared_innovations",
+]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,6 +50,20 @@ SLACK = 2.0
 """A scale falls to this many times what a window asks for: half of all windows ask for less than is right."""
 MAX_SCALE = 1e6
 """Largest factor on a variance."""
+
+
+@dataclass(frozen=True)
+class DoubtEvent:
+    """Fixes and estimate disagree for long, or no longer, or are given in to."""
+
+    time_s: float
+    """When [s]."""
+    run: int
+    """Run within the block."""
+    uav: int
+    """UAV."""
+    turn: Literal["begins", "ends", "given in"]
+    """What happens to the doubt."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +97,8 @@ class InnovationMonitor:
         self.alarms = np.zeros((runs, uavs), dtype=np.int64)
         self.largest: Array = np.ones((runs, uavs))
         self.events: list[MonitorEvent] = []
+        self.doubts: list[DoubtEvent] = []
+        self.doubted: Mask = np.zeros((runs, uavs), dtype=np.bool_)
         self._window = np.full((*shape, WINDOW), np.nan)
         self._count = np.zeros(shape, dtype=np.int64)
 
@@ -126,6 +154,26 @@ class InnovationMonitor:
         for at in zip(*np.nonzero(squared > 1.0), strict=True):
             self._set(at, min(MAX_SCALE, float(self.scale[at] * squared[at])), time_s, True)
 
+    def doubt(self, doubted: Mask, given_in: Mask, time_s: float) -> None:
+        """Note whose fixes are in doubt from now on; that it begins counts as an alarm.
+
+        Parameters
+        ----------
+        doubted : array of bool, shape (run, uav)
+            Whose fixes are.
+        given_in : array of bool, shape (run, uav)
+            Whose filter begins anew with the doubted fix.
+        time_s : float
+            Time of the epoch [s].
+        """
+        for run, uav in np.argwhere(doubted != self.doubted).tolist():
+            turn: Literal["begins", "ends", "given in"] = "begins" if doubted[run, uav] else "ends"
+            if given_in[run, uav]:
+                turn = "given in"
+            self.alarms[run, uav] += turn == "begins"
+            self.doubts.append(DoubtEvent(time_s, run, uav, turn))
+        self.doubted = doubted.copy()
+
     def _set(self, at: tuple[Any, ...], scale: float, time_s: float, alarm: bool) -> None:
         self.scale[at] = scale
         self._window[at] = np.nan
@@ -147,6 +195,7 @@ def squared_innovations(
     error_memory: Array,
     error_noise: Array,
     position_noise: float,
+    refused_miss: Array,
     out: Array,
 ) -> None:
     """Write squared innovations of the position over their variances, before any gate.
@@ -163,6 +212,10 @@ def squared_innovations(
         phi and 1 - phi^2 of the fix's error from one epoch to the next.
     position_noise : float
         Variance of the white noise in the position [m^2].
+    refused_miss : array, shape (run, uav, 3)
+        What the fix of the epoch before was off the estimate if it was refused [m]; NaN if it was not. A fix
+        after a refused one is compared with that, moved on by the estimate, and not with the estimate: a
+        jump is one wild innovation, however long it lasts.
     out : array, shape (run, uav, 3)
         Out; NaN where nothing is measured, or a number is not finite.
     """
@@ -177,6 +230,9 @@ def squared_innovations(
                 spread = c[0] + 2.0 * sigma * memory * c[2] + position_noise
                 spread += sigma * sigma * (memory * memory * c[7] + error_noise[a])
                 miss = fix_position[r, i, a] - x[0] - sigma * memory * x[2]
+                if np.isfinite(refused_miss[r, i, a]):
+                    miss = fix_position[r, i, a] - x[0] - refused_miss[r, i, a]
+                    spread = 2.0 * ((1.0 - memory) * sigma * sigma + position_noise)
                 # A sigma of zero means unknown: the fix is refused, and says nothing of sigmas.
                 if sigma > 0.0 and spread > 0.0 and np.isfinite(miss):
                     out[r, i, a] = miss * miss / spread

@@ -14,6 +14,7 @@ __all__ = [
     "code_noise_sigma_m",
     "multipath_sigma_m",
     "obliquity",
+    "p_reflected",
     "troposphere_mapping",
 ]
 
@@ -59,3 +60,32 @@ def code_noise_sigma_m(carrier_to_noise: Array, sigma_at_45_m: float) -> Array:
     Source: the form of the sigma-epsilon model (Hartinger and Brunner 1999).
     """
     return np.asarray(sigma_at_45_m * 10.0 ** ((45.0 - carrier_to_noise) / 20.0))
+
+
+def p_reflected(
+    excess_db: Array, fading_db: float, loss_db: float, loss_sigma_db: float, prior: Array
+) -> Array:
+    """Probability that a signal arrives by reflection alone, by Bayes' rule from its C/N0.
+
+    Parameters
+    ----------
+    excess_db : array
+        C/N0 over what is expected at its elevation [dB].
+    fading_db : float
+        Sigma of a signal in sight about that [dB]; taken as 0.1 at least.
+    loss_db, loss_sigma_db : float
+        Mean and sigma of the loss of a reflected one [dB]; the sigma is taken as 0.1 at least.
+    prior : array
+        Probability before its strength is known, < 1.
+
+    Returns
+    -------
+    array
+        At least what the loss' own upper tail leaves: strong signals are nearly certain, none is certain.
+    """
+    fading, spread = max(fading_db, 0.1), max(loss_sigma_db, 0.1)
+    # Of a signal stronger than its kind nobody learns that it is reflected because the tail is thinner there.
+    sight = (np.minimum(excess_db, 0.0) / fading) ** 2
+    other = ((np.minimum(excess_db, 0.0) + loss_db) / spread) ** 2
+    odds = prior / (1.0 - prior) * fading / spread * np.exp(np.clip(0.5 * (sight - other), -700.0, 700.0))
+    return np.asarray(odds / (1.0 + odds))

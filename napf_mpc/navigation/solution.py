@@ -54,6 +54,9 @@ class NavSolution:
     protection: Array | None = None
     """(run, uav, 2) horizontal and vertical protection level [m], not finite where there is none; None if
     navigation computes none."""
+    disputed: NDArray[np.bool_] | None = None
+    """(run, uav): whose fixes have contradicted its estimate for long, so that it is not available; None if
+    nothing watches."""
     lasting: Array | None = None
     """(run, uav, 3, 3) part of the position's covariance that nothing measured reduces [m^2]; or None."""
 

@@ -219,7 +219,11 @@ class QpPlanner:
         airborne = np.ones(nav.available.shape, dtype=bool) if nav.airborne is None else nav.airborne
         trusted = nav.trusted() & airborne
         self._tracks = nav.tracks
-        np.copyto(self._anchor, nav.position, where=trusted[..., None])
+        placed = trusted
+        if self._inflation.safety == "protection_level":
+            # A place held by a fix without a level would move with its error: hold by velocity.
+            placed = trusted | np.isfinite(nav.position).all(-1)
+        np.copyto(self._anchor, nav.position, where=placed[..., None])
         state = self._state(nav, trusted)
         covariance = self._covariance(nav, trusted)
         guide = None

@@ -97,7 +97,7 @@ class PotentialFieldPlanner:
             holding=~trusted,
             feedforward=np.zeros((*trusted.shape, 4)),
         )
-        return self._hold(command, trusted)
+        return self._hold(self._wait(command, nav), trusted)
 
     def _estimates(self, nav: NavSolution) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Positions, their covariances and which of them are trusted; every number finite."""
@@ -142,10 +142,32 @@ class PotentialFieldPlanner:
         return force, np.asarray((rho < influence).any(-1))
 
     def _move_anchors(self, nav: NavSolution, trusted: NDArray[np.bool_]) -> None:
-        """Note the last trusted place of each UAV; until there is one, the first that is a number."""
-        known = trusted | (~self._placed & np.isfinite(nav.position).all(-1))
+        """Note the last trusted place of each UAV; until there is one, the first that is a number.
+
+        A fix without a protection level may be any distance off, and a UAV that held its place by it would
+        be moved by that: it follows the fix, and holds by its velocity.
+        """
+        follows = self.inflation.safety == "protection_level"
+        known = trusted | ((~self._placed | follows) & np.isfinite(nav.position).all(-1))
         self._anchor = np.where(known[..., None], nav.position, self._anchor)
         self._placed |= known
+
+    def _wait(self, command: Command, nav: NavSolution) -> Command:
+        """Let a formation brake and wait for a UAV whose navigation is disputed.
+
+        It holds where it is, between the lanes of others, and nothing here keeps UAVs that pass it away.
+        """
+        if nav.disputed is None or not nav.disputed.any():
+            return command
+        waits = np.broadcast_to(nav.disputed.any(-1, keepdims=True), nav.disputed.shape)
+        stopped = waits[..., None]
+        return replace(
+            command,
+            position=np.where(stopped, self._anchor, command.position),
+            velocity=np.where(stopped, 0.0, command.velocity),
+            direction=np.where(stopped, 0.0, command.direction),
+            holding=command.holding | waits,
+        )
 
     def _hold(self, command: Command, trusted: NDArray[np.bool_]) -> Command:
         """Hover at the last trusted place where navigation is not to be trusted: never "no obstacle"."""

@@ -32,7 +32,7 @@ class _NavigationBase(Section):
     innovation_gate_sigma: float = Field(5.0, ge=0.0, le=100.0)
     """Filter: a fix farther than this many sigmas from what is expected is refused; 0 for no gate."""
     monitor: Literal["none", "innovations"] = "none"
-    """Filter: whether its normalised innovations are watched and reported sigmas that are too small scaled (docs/integrity.md)."""  # noqa: E501
+    """Filter: whether its normalised innovations are watched, reported sigmas that are too small scaled, and fixes that contradict the estimate held out while the UAV holds (docs/integrity.md)."""  # noqa: E501
     filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
     """Filter: correlation time that it assumes of the fix's error; by default the error's own."""
     filter_coast_sigma_m: float = Field(10.0, ge=1e-3, le=1e4)
@@ -177,6 +177,14 @@ class Gnss(_NavigationBase):
     """Probability of a test of residuals to fail without a fault."""
     max_pdop: float = Field(20.0, ge=1.0, le=1e6)
     """Position dilution of precision above which there is no fix."""
+    integrity: Literal["none", "araim"] = "none"
+    """Whether receivers compute protection levels, of plain positions of the signals that they trust (docs/integrity.md)."""  # noqa: E501
+    p_hmi: float = Field(1e-3, ge=1e-9, le=0.1)
+    """Protection levels: probability that the error of a fix leaves one of them without an alarm."""
+    prior_reflected: float = Field(0.7, ge=0.0, le=0.99)
+    """Protection levels: chance that a signal on the horizon is a reflection alone, before its C/N0 is known; it falls with the angle to 0 in the zenith."""  # noqa: E501
+    p_satellite: float = Field(1e-5, ge=0.0, le=0.1)
+    """Protection levels: chance that a satellite is faulty."""
     filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] = 2.0
     """Filter: correlation time that it assumes of the error but for what UAVs have in common, which lasts."""
     credit: str = Field("", max_length=500)

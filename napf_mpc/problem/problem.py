@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from napf_mpc.problem.formation import Formation, Listed, Square
 from napf_mpc.problem.mission import GoalMission, Mission
-from napf_mpc.problem.navigation import GaussMarkov, Navigation, Recorded
+from napf_mpc.problem.navigation import GaussMarkov, Gnss, Navigation, Recorded
 from napf_mpc.problem.planner import Planner
 from napf_mpc.problem.section import MAX_FIXES, Section
 from napf_mpc.problem.simulation import Reference, Simulation
@@ -108,6 +108,12 @@ class Problem(Section):
             return [
                 'planner.safety = "protection_level" bounds the error of fixes, not of a filter\'s estimate: '
                 'set navigation.filter = "none", or safety = "k_sigma"'
+            ]
+        silent = isinstance(navigation, Gnss) and navigation.integrity == "none"
+        if self.planner.safety == "protection_level" and silent:
+            return [
+                'planner.safety = "protection_level": receivers compute levels with '
+                'navigation.integrity = "araim" only; set it, or safety = "k_sigma"'
             ]
         return []
 

@@ -18,6 +18,7 @@ RULES = {
     "negative": "gate",
     "asymmetric": "gate",
     "jump": "gate",
+    "jump_stays": "gate",
     "stuck": "gate",
     "back": "gate",
     "slow": "missed",
@@ -46,15 +47,17 @@ def test_it_is_survived(kind: str) -> None:
     """Every number stays finite, no command or rotor leaves its limits, and the others never pay for it."""
     after = flown(kind)
     assert not after.watch.outside.any()
-    assert not after.score.obstacle_contact[:, 1:].any()
-    if kind not in ("jump", "stuck"):  # wrong fixes that go on are believed in the end
-        assert not after.score.obstacle_contact.any()
+    assert not after.score.obstacle_contact.any()
+    assert not after.score.uav_contact.any()
     assert np.isfinite(after.score.metrics["path_rms_m"]).all()
-    assert np.isfinite(after.watch.largest_error_m).all()
-    if kind != "outage_69":
+    if kind != "outage_69":  # a minute of dead reckoning
+        # Of a jump of 10 m, or of 20 m that a UAV flies while its position is stuck, next to nothing.
+        assert after.watch.largest_error_m.max() < 5.0
+    if kind == "jump_stays":
+        assert not after.score.finished.any()
+        assert after.watch.unavailable.min() * after.watch.tick_s > 150.0  # of 200 s: it holds
+    else:
         assert after.score.finished.all()
-        # The most is the way that a UAV flies while its position is stuck: 20 m in 10 s.
-        assert after.watch.largest_error_m.max() < 20.0
 
 
 def test_without_a_fault_nothing_is_flagged() -> None:

@@ -123,11 +123,13 @@ def test_a_fifth_of_the_sigma_is_flagged_in_time_and_in_the_results() -> None:
     for run_index, uav, cause, time_s in zip(
         events["run"], events["uav"], events["cause"], events["t_s"], strict=True
     ):
+        if "fixes" in str(cause):  # a dispute begins or ends
+            continue
         first.setdefault((int(run_index), int(uav), str(cause)), float(time_s))
     assert {key[0] for key in first} == {3, 4, 5, 6}
     assert len(first) == 4 * 4 * 3
     assert max(first.values()) <= 3.0  # 30 fixes at 10 Hz
-    assert all("too small for its innovations" in str(cause) for cause in events["cause"])
+    assert all("too small for its innovations" in cause for _, _, cause in first)
     assert set(events["action"][0].split(" x ")[0].split()) <= {"sigma", "east", "north", "up"}
 
 

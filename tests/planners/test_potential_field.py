@@ -401,6 +401,22 @@ def test_who_holds_stays_where_it_was_and_the_others_wait_for_it() -> None:
     assert again.velocity[0, 3, 0] == pytest.approx(3.0)
 
 
+def test_a_formation_waits_for_a_uav_in_dispute_but_others_do_not() -> None:
+    nav = solution(np.stack([SLOTS, SLOTS]))
+    disputed = np.zeros((2, 4), dtype=bool)
+    disputed[0, 2] = True
+    planner = NapfPlanner(problem())
+    planner.reset(ObstacleSet.empty(), 2)
+    command = planner.step(replace(nav, available=~disputed, disputed=disputed), 0.0)
+    assert command.holding.tolist() == [[True] * 4, [False] * 4]
+    assert (command.velocity[0] == 0.0).all()
+    assert (np.linalg.norm(command.velocity[1], axis=-1) > 1.0).all()
+    # Without a dispute, one that is not available holds alone.
+    planner.reset(ObstacleSet.empty(), 2)
+    alone = planner.step(replace(nav, available=~disputed), 0.0)
+    assert alone.holding.sum() == 1
+
+
 def test_an_obstacle_is_not_forgotten_for_want_of_a_sigma() -> None:
     """2 m from a ball with sigma reported as zero or NaN: hold, and never fly on as if nothing were there."""
     for how in ("sigma zero", "sigma NaN", "sigma negative"):

@@ -1,0 +1,141 @@
+"""Compiled levels: those of the reference, true under faults that are counted, and after exclusion."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from napf_mpc.navigation.integrity.araim import IntegrityRequirement, RangeErrors, protection_level
+from napf_mpc.navigation.integrity.levels import Levels, LevelSettings, NoLevel, protection_levels
+from napf_mpc.navigation.pseudorange_solution import SolverSettings, solve
+from napf_mpc.risk import wilson
+from napf_mpc.streams import Stream, normals, uniforms
+
+# Azimuth and elevation [deg] of eight satellites of one constellation and six of another.
+SKY = [
+    (10, 20), (60, 45), (105, 15), (150, 65), (200, 35), (245, 75), (290, 25), (335, 50),
+    (30, 60), (85, 30), (140, 40), (190, 18), (260, 55), (310, 38),
+]  # fmt: skip
+CLOCK = np.array([0] * 8 + [1] * 6)
+AZIMUTH, ELEVATION = np.deg2rad(np.array(SKY, dtype=float)).T
+SIGHT = np.stack(
+    [np.cos(ELEVATION) * np.sin(AZIMUTH), np.cos(ELEVATION) * np.cos(AZIMUTH), np.sin(ELEVATION)], axis=-1
+)
+SIGMA = 1.0 + 1.0 / SIGHT[:, 2]
+PLAIN = SolverSettings("plain", exclude=False, max_pdop=1e6)
+
+
+def levels(ranges: np.ndarray, p_fault: float | np.ndarray, **changes: Any) -> Levels:
+    """Levels of receivers under one sky."""
+    shape = ranges.shape
+    values: dict[str, Any] = {
+        "directions": np.broadcast_to(SIGHT, (*shape, 3)),
+        "clock": CLOCK,
+        "ranges": ranges,
+        "sigma": np.broadcast_to(SIGMA, shape).copy(),
+        "p_fault": np.broadcast_to(p_fault, shape).copy(),
+        "usable": np.ones(shape, dtype=bool),
+        "settings": LevelSettings(2e-3, 2e-2),
+    }
+    return protection_levels(**(values | changes))
+
+
+@pytest.mark.parametrize("p_fault", [0.0, 1e-4, 3e-3, 0.02])
+def test_levels_of_all_in_view_are_those_of_the_reference(p_fault: float) -> None:
+    """Half of P_HMI goes to sets with exclusion; the rest is the reference's sum, to a centimetre above."""
+    mine = levels(np.zeros((1, 14)), p_fault)
+    unmonitored = 2e-4
+    asked = IntegrityRequirement(
+        p_hmi_horizontal=5e-4, p_hmi_vertical=5e-4, p_fa_horizontal=1e-2, p_fa_vertical=1e-2,
+        p_unmonitored=unmonitored,
+    )  # fmt: skip
+    ranges = RangeErrors(SIGHT, CLOCK, SIGMA, np.zeros(14), np.full(14, p_fault), {})
+    reference = protection_level(ranges, asked)
+    # The reference looks at all hypotheses of a number of faults, this at the likely ones; what is left
+    # unmonitored is taken from half of P_HMI there, from all of it here.
+    tolerance = 0.02 if p_fault == 0.0 else 0.08 * reference.vertical_m
+    assert mine.level_m[0] == pytest.approx([reference.horizontal_m, reference.vertical_m], abs=tolerance)
+    assert mine.hypotheses[0] <= max(1, len(reference.prior))
+
+
+def test_rank_one_changes_are_solutions_without_a_satellite() -> None:
+    """A fault that is seen is excluded, and what is left is the plain solution of the others."""
+    for bad in range(14):
+        ranges = np.where(np.arange(14) == bad, 60.0, 0.0)[None]
+        found = levels(ranges, 3e-3)
+        assert found.used[0].tolist() == [s != bad for s in range(14)]
+        assert found.excluded[0] == 1
+        clean = levels(np.zeros((1, 14)), 3e-3)
+        assert (found.level_m[0] > clean.level_m[0]).all()  # its share is a fiftieth of that of all in view
+        assert (found.level_m[0] < 6.0 * clean.level_m[0]).all()
+        answer = solve(SIGHT[None], CLOCK, ranges, SIGMA[None], found.used, PLAIN)
+        np.testing.assert_allclose(answer.offset[0], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("fault_m", [0.0, 12.0, 60.0])
+def test_the_error_leaves_the_level_no_more_often_than_asked(fault_m: float) -> None:
+    """10,000 epochs, 4 % of signals wrong by so much, P_HMI 0.002: with exclusion, alarms and all."""
+    epochs = 10_000
+    noise = normals(5, range(1), Stream.OWN_ERROR, 14, 1, epochs)[0, :, 0].T
+    faulty = uniforms(5, range(1), Stream.OUTAGE, 14, 1, epochs)[0, :, 0].T < 0.04
+    ranges = noise * SIGMA + fault_m * faulty
+    found = levels(ranges, 0.04)
+    known = np.isfinite(found.level_m).all(-1)
+    wide = np.broadcast_to(SIGHT, (epochs, 14, 3))
+    spread = np.broadcast_to(SIGMA, (epochs, 14)).copy()
+    error = solve(wide, CLOCK, ranges, spread, found.used & known[:, None], PLAIN).offset
+    outside = np.hypot(error[:, 0], error[:, 1]) > found.level_m[:, 0]
+    outside |= np.abs(error[:, 2]) > found.level_m[:, 1]
+    assert wilson(int((known & outside).sum()), epochs).low <= 2e-3
+    assert known.mean() > 0.9
+    if fault_m == 0.0:
+        assert (found.excluded > 0).mean() < 0.02  # false alarms
+    if fault_m == 60.0:
+        several = faulty.sum(-1)
+        assert (found.excluded[known & (several == 1)] == 1).mean() > 0.95
+        plain = solve(wide, CLOCK, ranges, spread, np.ones_like(faulty), PLAIN)
+        k_sigma = 3.5 * np.sqrt(plain.covariance[:, 2, 2])
+        assert (np.abs(plain.offset[:, 2]) > k_sigma).mean() > 0.05  # what 3.5 sigma are worth here
+
+
+def test_levels_do_not_depend_on_who_else_there_is() -> None:
+    ranges = normals(6, range(1), Stream.OWN_ERROR, 14, 1, 40)[0, :, 0].T * 3.0
+    together, alone = levels(ranges, 0.01), levels(ranges[17:18], 0.01)
+    np.testing.assert_array_equal(together.level_m[17:18], alone.level_m)
+    np.testing.assert_array_equal(together.used[17:18], alone.used)
+
+
+def test_where_there_is_no_level_it_says_why() -> None:
+    few = np.zeros((1, 14), dtype=bool)
+    few[0, [0, 1, 2, 8, 9]] = True  # five satellites of two systems; six are needed
+    found = levels(np.zeros((1, 14)), 1e-3, usable=few)
+    assert (NoLevel(int(found.why[0])), found.level_m[0].tolist()) == (NoLevel.FEW, [math.inf, math.inf])
+    likely = levels(np.zeros((1, 14)), 0.5)
+    assert likely.why[0] == NoLevel.UNMONITORED
+    wild = levels(100.0 * np.arange(14.0)[None] ** 2, 1e-3)
+    assert wild.why[0] in (NoLevel.ALARM, NoLevel.FEW)
+    assert np.isinf(wild.level_m).all()
+
+
+def test_more_satellites_than_it_looks_at_lose_the_likelier_faulty() -> None:
+    sight = np.concatenate([SIGHT] * 3)
+    p = np.full(42, 1e-3)
+    p[[3, 7, 20, 21, 22, 30, 31, 38, 39, 40]] = 5e-3
+    found = protection_levels(
+        sight[None], np.zeros(42, dtype=np.int64), np.zeros((1, 42)), np.full((1, 42), 2.0), p[None],
+        np.ones((1, 42), dtype=bool), LevelSettings(),
+    )  # fmt: skip
+    assert found.used[0].sum() == 32
+    assert not found.used[0, p == 5e-3].any()
+
+
+@pytest.mark.parametrize(("sigma_m", "p_fault"), [(0.0, 1e-3), (2.0, 1.0)])
+def test_what_is_no_sky(sigma_m: float, p_fault: float) -> None:
+    with pytest.raises(ValueError, match="ranges must be finite, sigma > 0 and 0 <= p_fault < 1"):
+        levels(np.zeros((1, 14)), p_fault, sigma=np.full((1, 14), sigma_m))
+
+
+def test_what_cannot_be_asked() -> None:
+    with pytest.raises(ValueError, match="p_hmi = 0"):
+        LevelSettings(p_hmi=0.0)

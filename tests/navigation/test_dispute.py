@@ -1,0 +1,115 @@
+"""A watched filter whose fixes contradict it: what is refused, when the UAV holds, and how it ends."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from napf_mpc.navigation.filter import CALM_S, GATE_PATIENCE_S, FilterModel, KalmanFilter
+from napf_mpc.problem import GaussMarkov
+
+PERIOD_S = 0.1
+SPEED = np.array([2.0, 0.0, 0.0])
+Offset = Callable[[float], np.ndarray]
+
+
+def north(metres: float) -> np.ndarray:
+    return np.array([0.0, metres, 0.0])
+
+
+class Flown:
+    """A UAV at 2 m/s whose fixes are true but for what is added; one step and fix every 0.1 s."""
+
+    def __init__(
+        self,
+        seconds: float,
+        position: Offset,
+        velocity: Offset | None = None,
+        monitor: str = "innovations",
+        sigma_m: float = 1.0,
+    ) -> None:
+        navigation = GaussMarkov.model_validate({"filter": "kalman", "monitor": monitor})
+        self.filter = KalmanFilter(FilterModel.of_navigation(navigation, PERIOD_S, 1), 1, 1)
+        one, all_of = np.ones(1, dtype=bool), np.ones((1, 1), dtype=bool)
+        self.time_s, self.error, self.sigma, self.available = [], [], [], []
+        for n in range(round(seconds / PERIOD_S)):
+            t = n * PERIOD_S
+            if n:
+                self.filter.predict(np.zeros((1, 1, 3)), one)
+            place = (SPEED * t + position(t)).reshape(1, 1, 3)
+            speed = (SPEED + (velocity(t) if velocity else 0.0)).reshape(1, 1, 3)
+            self.filter.correct(place, speed, sigma_m**2 * np.eye(3)[None, None], all_of, True, one)
+            nav = self.filter.solution(t, np.zeros((1, 1, 3)), np.zeros((1, 1, 3)))
+            self.time_s.append(t)
+            self.error.append(float(np.linalg.norm(nav.position[0, 0] - SPEED * t)))
+            self.sigma.append(float(np.sqrt(nav.covariance[0, 0, 1, 1])))
+            self.available.append(bool(nav.available[0, 0]))
+
+    def at(self, t: float) -> int:
+        return round(t / PERIOD_S)
+
+    @property
+    def turns(self) -> list[tuple[float, str]]:
+        assert self.filter.monitor is not None
+        return [(round(event.time_s, 1), event.turn) for event in self.filter.monitor.doubts]
+
+
+def jump(metres: float, begin_s: float = 10.0, end_s: float = 1e9) -> Offset:
+    return lambda t: north(metres if begin_s <= t < end_s else 0.0)
+
+
+@pytest.mark.parametrize("sigma_m", [1.0, 2.5])
+def test_a_jump_is_held_out_and_the_uav_holds_until_it_is_undone(sigma_m: float) -> None:
+    """Also where 10 m are a possible error, four sigmas: what counts is that it came at once."""
+    flown = Flown(45.0, jump(10.0, 10.0, 30.0), sigma_m=sigma_m)
+    assert max(flown.error) < 0.1  # none of the 10 m
+    assert flown.turns == [(12.9, "begins"), (30.0, "ends")]
+    held = [t for t, there in zip(flown.time_s, flown.available, strict=True) if not there]
+    assert (held[0], held[-1]) == pytest.approx((12.9, 29.9))
+    assert flown.filter.refused_fixes[0, 0] == 200
+    assert flown.filter.monitor is not None
+    assert flown.filter.monitor.alarms[0, 0] == 1  # the dispute itself: sigmas are not what is wrong
+
+
+def test_unwatched_the_same_jump_is_believed_after_three_seconds() -> None:
+    flown = Flown(20.0, jump(10.0), monitor="none")
+    assert flown.error[flown.at(10.0 + GATE_PATIENCE_S - 0.2)] < 0.1
+    assert flown.error[flown.at(10.0 + GATE_PATIENCE_S + 0.2)] > 9.9
+
+
+def test_velocity_is_the_second_witness() -> None:
+    """A minute without a position to believe: by its velocity the estimate is as good as before."""
+    flown = Flown(75.0, jump(10.0))
+    assert not flown.available[-1]
+    assert flown.sigma[-1] < flown.sigma[flown.at(9.9)] + 0.05
+    assert max(flown.error) < 0.1
+
+
+def test_without_a_witness_the_estimate_is_given_up_when_it_is_worth_nothing() -> None:
+    """Velocity wrong as well: sigma grows to 10 m, then the filter begins anew, as unsure as they differ."""
+    flown = Flown(60.0, jump(30.0), lambda t: north(8.0 if t >= 10.0 else 0.0))
+    assert [turn for _, turn in flown.turns][:2] == ["begins", "given in"]
+    when = flown.turns[1][0]
+    assert flown.sigma[flown.at(when) - 1] > 9.5
+    assert flown.sigma[flown.at(when)] >= 29.0
+    assert flown.filter.monitor is not None
+    assert flown.filter.monitor.events[-1].axis == 1
+
+
+def test_fixes_that_stay_near_for_long_are_used_again() -> None:
+    """A jump of 2.5 m is 6 sigmas of what is new in an error, but 2 of the error itself."""
+    flown = Flown(60.0, jump(2.5))
+    (began, first), (ended, last) = flown.turns
+    assert (first, last) == ("begins", "ends")
+    assert ended - began == pytest.approx(CALM_S, abs=0.3)
+    assert flown.available[-1]
+    assert flown.error[-1] < 2.5
+
+
+def test_a_position_that_stands_still_while_its_velocity_does_not_is_refused_at_once() -> None:
+    flown = Flown(15.0, lambda t: np.minimum(0.0, SPEED * (10.0 - t)) if t < 13.0 else np.zeros(3))
+    assert max(flown.error) < 0.1
+    assert flown.filter.refused_fixes[0, 0] == 29  # from the second of thirty on
+    # Who hovers may well repeat itself.
+    hovering = Flown(15.0, lambda t: -SPEED * t, lambda t: -SPEED)
+    assert hovering.filter.refused_fixes[0, 0] == 0
