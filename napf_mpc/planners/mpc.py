@@ -24,7 +24,7 @@ from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.cohesion import drawn_together
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
 from napf_mpc.planners.guess import cut_at_obstacles
-from napf_mpc.planners.guidance import Guidance, guidance_covariance
+from napf_mpc.planners.guidance import Guidance, guidance_covariance, widest
 from napf_mpc.planners.guide import Guide
 from napf_mpc.planners.guided_field import waiting_reasons
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
@@ -196,7 +196,7 @@ class QpPlanner:
         trusted = nav.trusted()
         state = self._state(nav, trusted)
         carried = self._carried(state, time_s)
-        covariance = self._covariance(nav, trusted)
+        covariance = self._covariance(nav, trusted, carried, state)
         reference, way = self._references(state, carried, nav, covariance, trusted, None)
         guess, _ = self._guess(state, way, carried, time_s)
         horizon = self._horizon(guess, covariance, nav, trusted, time_s)
@@ -210,17 +210,16 @@ class QpPlanner:
         self._tracks = nav.tracks
         self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
         state = self._state(nav, trusted)
-        covariance = self._covariance(nav, trusted)
+        carried = self._carried(state, time_s)
+        covariance = self._covariance(nav, trusted, carried, state)
         guide = None
         if self._guidance is not None:
-            expected = self.problem.planner.covariance == "expected"
-            room = guidance_covariance(nav, trusted, covariance[:, :, -1] if expected else None)
+            room = guidance_covariance(nav, trusted, self._room(covariance))
             # Raw measurements jump by more than a taut way could gain.
             flying = np.asarray(airborne.any(-1))
             guide = self._guidance.step(
                 state[..., POSITION], room, trusted, time_s, taut=nav.filtered, flying=flying
             )
-        carried = self._carried(state, time_s)
         reference, way = self._references(state, carried, nav, covariance, trusted, guide)
         began = 0.0 if self._clock is None else self._clock()
         guess = self._guess(state, way, carried, time_s)
@@ -349,16 +348,37 @@ class QpPlanner:
             tracks=nav.tracks,
         )
 
-    def _covariance(self, nav: NavSolution, trusted: Mask) -> Array:
+    def _covariance(
+        self, nav: NavSolution, trusted: Mask, carried: tuple[Array, Array] | None, state: Array
+    ) -> Array:
         """Covariance of the position (run, uav, N, 3, 3) at the end of each stage, as the problem asks."""
         asked = self.problem.planner.covariance
         if asked == "held":
             covariance = np.repeat(nav.position_covariance[:, :, None], self._model.stages, axis=2)
         else:
-            covariance = nav.position_covariance_ahead(self._model.times_s, with_fixes=asked == "expected")
+            places = None
+            if asked == "mapped" and carried is not None:
+                places = np.ascontiguousarray(carried[0][..., POSITION])
+            elif asked == "mapped":
+                places = self._straight_ahead(state)
+            fixes = asked != "propagated"
+            covariance = nav.position_covariance_ahead(self._model.times_s, fixes, places)
         return (
             covariance if trusted.all() else np.where(trusted[..., None, None, None], covariance, np.eye(3))
         )
+
+    def _straight_ahead(self, state: Array) -> Array:
+        """Places (run, uav, N, 3) along the path at the reference speed, from where UAVs are."""
+        assert isinstance(self.problem.mission, FormationMission)
+        way = self.problem.mission.speed_mps * self._model.times_s[:, None] * self._frame.along
+        return np.asarray(state[:, :, None, POSITION] + way)
+
+    def _room(self, covariance: Array) -> Array | None:
+        """Covariance (run, uav, 3, 3) that guidance is to expect, of those at the stages; or None."""
+        asked = self.problem.planner.covariance
+        if asked == "mapped":
+            return widest(covariance)
+        return np.asarray(covariance[:, :, -1]) if asked == "expected" else None
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""

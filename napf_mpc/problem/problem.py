@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from napf_mpc.problem.formation import Formation, Listed, Square
 from napf_mpc.problem.mission import GoalMission, Mission
-from napf_mpc.problem.navigation import GaussMarkov, Navigation, Recorded
+from napf_mpc.problem.navigation import GaussMarkov, Gnss, Navigation, Recorded
 from napf_mpc.problem.planner import Planner
 from napf_mpc.problem.section import MAX_FIXES, Section
 from napf_mpc.problem.simulation import Reference, Simulation
@@ -92,6 +92,11 @@ class Problem(Section):
             return [
                 f'navigation.monitor = "{navigation.monitor}" watches a filter\'s innovations: set '
                 'navigation.filter = "kalman"'
+            ]
+        if self.planner.covariance == "mapped" and not isinstance(navigation, Gnss):
+            return [
+                'planner.covariance = "mapped" follows the satellites in sight of navigation.kind = "gnss": '
+                f'navigation.kind = "{navigation.kind}" has none; use covariance = "expected"'
             ]
         if self.planner.safety == "overbound":
             if not isinstance(navigation, Recorded):
