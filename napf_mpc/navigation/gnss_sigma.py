@@ -23,9 +23,9 @@ __all__ = ["expected_variance", "sigma_map"]
 Array = NDArray[np.float64]
 
 CELL_M, SLICE_M = 2.5, 10.0
-"""Distance of nodes on the level and of slices, if that makes no more than :data:`MOST_NODES` [m]."""
-MOST_NODES = 20_000
-"""Nodes of a run's map at most: half a second in a city, and a megabyte."""
+"""Distance of nodes on the level, wider if else there were more than :data:`MOST_NODES`; of slices [m]."""
+MOST_NODES, MOST_SLICES = 20_000, 20
+"""Nodes of a run's map at most (half a second of a core in a city, and a megabyte), and of its slices."""
 ASIDE_M, BELOW_M, ABOVE_M = 30.0, 10.0, 20.0
 """How far the map reaches beyond the slots: to the sides, down and up [m]."""
 BEHIND_M, BEYOND_M = 10.0, 50.0
@@ -64,12 +64,12 @@ def sigma_map(problem: Problem, scene: GnssScene) -> SigmaMap:
 
 def _grid(size: Array) -> tuple[Array, tuple[int, int, int]]:
     """Distances of nodes (3,) and their numbers along, left and up, for a volume (3,) [m]."""
-    cell = np.array([CELL_M, CELL_M, SLICE_M])
+    cell = np.array([CELL_M, CELL_M, max(SLICE_M, float(size[2]) / MOST_SLICES)])
     while True:
         along, left, up = (int(count) for count in np.ceil(size / cell - 1e-9) + 1)
         if along * left * up <= MOST_NODES:
             return cell, (along, left, up)
-        cell *= 1.05
+        cell[:2] *= 1.05
 
 
 def expected_variance(scene: GnssScene, places: Array, time_s: float) -> Array:
