@@ -142,7 +142,7 @@ def prediction_rows(label: str, watch: Watch) -> list[str]:
 
 def flight_row(way: str, score: Score, cost_s: float) -> str:
     """Line of one way to fly."""
-    hit = score.obstacle_contact.any(-1)
+    hit = np.asarray(score.obstacle_contact.any(-1))
     rate = wilson(int(hit.sum()), len(hit))
 
     def middle(name: str) -> str:
@@ -186,7 +186,7 @@ def main() -> None:
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
     for way, (score, _, cost_s) in flown.items():
         print(flight_row(way, score, cost_s))
-    hits = [flown[way][0].obstacle_contact.any(-1) for way in WAYS]
+    hits = [np.asarray(flown[way][0].obstacle_contact.any(-1)) for way in WAYS]
     only = int((hits[0] & ~hits[1]).sum()), int((hits[1] & ~hits[0]).sum())
     print(f"\nContacts of one only: {only[0]} expected, {only[1]} mapped; McNemar p = {mcnemar(*only):.3g}")
     for name in ("path_rms_m", "shape_rms_m", "min_clearance_m", "finish_time_s"):

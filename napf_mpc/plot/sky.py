@@ -221,7 +221,8 @@ def sigma_map_figure(problem: Problem, scene: GnssScene) -> Figure:
     tall = width * (high[1] - low[1]) / (high[0] - low[0])
     slices = len(made.heights_m)
     page = Page.of_size(PAGE_IN, 0.42 + slices * (tall + 0.3), credit_of(problem))
-    norm = LogNorm(float(sigma.min()), float(sigma.max()))
+    least, most = float(sigma.min()), float(sigma.max())
+    norm = LogNorm(least, most)
     around = Affine2D().translate(*-made.frame.origin[:2]).rotate(-made.frame.heading_rad)
     lanes = formation_offsets(problem.formation)[:, 1]
     for n, above in enumerate(made.heights_m):
@@ -247,9 +248,7 @@ def sigma_map_figure(problem: Problem, scene: GnssScene) -> Figure:
     bar = page.figure.colorbar(image, cax=page.axes(0.55 + width + 0.1, 0.42, 0.09, whole))
     bar.outline.set_linewidth(0.6)
     ticks = [
-        tick
-        for tick in (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, _MOST_SIGMA_M)
-        if norm.vmin <= tick <= norm.vmax
+        tick for tick in (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, _MOST_SIGMA_M) if least <= tick <= most
     ]
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.minorticks_off()

@@ -234,6 +234,7 @@ def test_without_a_filter_the_covariance_takes_the_maps_ratio_and_coasts_where_i
     dark = replace(raw, sigma_map=canyon(dark=True)[1])
     variance = sigmas(dark, along(10.0, 80.0)) ** 2
     lost = np.maximum.accumulate(variance > 8.0 + 1e-12)
+    assert 3 < lost.sum() < len(lost)
     np.testing.assert_allclose(variance[~lost], 8.0)
     age = 0.5 * np.arange(1, lost.sum() + 1)
     np.testing.assert_allclose(variance[lost], 8.0 + (0.1 * age) ** 2)
