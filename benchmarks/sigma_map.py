@@ -1,12 +1,15 @@
 """Whether covariance that follows the place, Sigma(p), predicts better, and what the QP planner makes of it.
 
-    python benchmarks/sigma_map.py [--problem nishi_shinjuku_gnss --data DIR] [--runs N] [--seed S]
+    python benchmarks/sigma_map.py [--problem nishi_shinjuku_gnss --data DIR] [--runs N] [--seed S] [--lanes]
 
 Flies every run twice on the same skies, scenes and errors, with ``planner.covariance = "expected"`` and
 ``"mapped"``. On both flights the navigation filter is asked, once a second, what covariance it expects 2 s
 and 5 s ahead at the places of the plan, with the sigma map and without; that is held against what the filter
 reports then, and the error of its estimate. Samples of a run are correlated: intervals are over runs. Prints
 Markdown. The score is 0.5 (ln variance + error^2 / variance), mean over axes: the less, the better.
+
+With ``--lanes`` nobody flies: UAVs stay in their slots at the reference speed, and what their receivers
+report is held against the map, and against what was reported some metres before.
 
 Seeds 300 to 399 are for development, 7000 to 7999 for reports.
 """
@@ -21,8 +24,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.closed_loop import Scenario, build_scenario, closed_loop
+from napf_mpc.closed_loop import Scenario, build_scenario, closed_loop, formation_mission
 from napf_mpc.evaluate import MissionScore, Score
+from napf_mpc.formation import PathFrame, formation_offsets
+from napf_mpc.navigation.gnss import GnssScene
+from napf_mpc.navigation.gnss_fixes import GnssErrors
+from napf_mpc.navigation.gnss_sigma import expected_variance
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.mpc import QpPlanner
 from napf_mpc.planners.planner import Command
@@ -100,6 +107,54 @@ def fly(problem: Problem, scenario: Scenario) -> tuple[Score, Watch, float]:
     return judge.score(flight), watch, time.process_time() - began
 
 
+def lane_rows(problem: Problem, seed: int, runs: int, folder: Path | None) -> list[str]:
+    """How far sigmas that receivers report on their lanes are from what was foreseen, as a table's rows."""
+    scenario = build_scenario(problem, seed, range(runs), folder)
+    errors, made = scenario.errors, scenario.sigma_map
+    assert isinstance(errors, GnssErrors)
+    assert made is not None
+    mission = formation_mission(problem)
+    frame, slots = PathFrame.of_mission(mission), formation_offsets(problem.formation)
+    fixes = errors.begin()
+    reported: list[Array] = []
+    foreseen: dict[str, list[Array]] = {
+        "at the place, as due": [],
+        "at the place, sky of the start": [],
+        "map": [],
+    }
+    for epoch in range(int(mission.length_m / mission.speed_mps)):
+        moved = frame.to_world(slots + np.array([mission.speed_mps * epoch, 0.0, 0.0]))
+        fix = fixes.fix(epoch, np.repeat(moved[None], runs, axis=0))
+        variance = np.einsum("...aa->...a", fix.covariance)
+        reported.append(np.where(fix.available[..., None], variance, np.nan))
+        for name, time_s in (("at the place, as due", float(epoch)), ("at the place, sky of the start", 0.0)):
+            parts = [expected_variance(_of_run(errors.scene, run), moved, time_s) for run in range(runs)]
+            foreseen[name].append(np.array(parts)[..., :3] + np.array(parts)[..., 3:])
+        own, lasting = made.variance(np.repeat(moved[None], runs, axis=0))
+        foreseen["map"].append(own + lasting)
+    then = np.array(reported)
+    rows = []
+    free = np.isfinite(np.array(foreseen["at the place, as due"]))  # a lane may lead through a house
+    for name, values in foreseen.items():
+        rows.append(_lane_row(name, 0.5 * np.log(np.array(values) / then), free))
+    for ahead in (2, 5):
+        apart = 0.5 * np.log(then[:-ahead] / then[ahead:])
+        rows.append(_lane_row(f"as reported {ahead} s before", apart, free[ahead:] & free[:-ahead]))
+    return rows
+
+
+def _lane_row(name: str, apart: Array, free: Mask) -> str:
+    sound = free & np.isfinite(apart)
+    squares = np.where(sound, apart, 0.0) ** 2
+    rms = np.sqrt(squares.sum((0, 2, 3)) / sound.sum((0, 2, 3)))
+    low, middle, high = np.quantile(apart[sound], (0.05, 0.5, 0.95))
+    return f"| {name} | {mean_with_interval(rms)} | {middle:+.3f} [{low:+.3f}, {high:+.3f}] |"
+
+
+def _of_run(scene: GnssScene, run: int) -> GnssScene:
+    return scene.of_run(run, scene.obstacles if scene.obstacles.n_scenes == 1 else scene.obstacles.scene(run))
+
+
 def mean_with_interval(values: Array) -> str:
     """Mean of one value a run, with 95 % by the spread over runs."""
     half = 1.96 * values.std(ddof=1) / np.sqrt(len(values))
@@ -164,7 +219,16 @@ def main() -> None:
     parser.add_argument("--data", type=Path)
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=7000)
+    parser.add_argument("--lanes", action="store_true")
     options = parser.parse_args()
+    if options.lanes:
+        problem = load_problem(options.problem, {"planner.covariance": "mapped", "navigation.rate_hz": 1.0})
+        print(f"{options.problem}, N = {options.runs}, seed {options.seed}")
+        print(
+            "| sigma foreseen | ln(sigma / reported), rms [95 %] | median [5 %, 95 %] |\n| --- | --- | --- |"
+        )
+        print("\n".join(lane_rows(problem, options.seed, options.runs, options.data)))
+        return
     problems = {way: load_problem(options.problem, {"planner.covariance": way}) for way in WAYS}
     began = time.process_time()
     plain = build_scenario(problems["expected"], options.seed, range(options.runs), options.data)
