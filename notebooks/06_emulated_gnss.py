@@ -66,10 +66,10 @@ with house_style():
 figure
 
 # %% [markdown]
-# And what a planner can know of it beforehand: the sigma of the fix that buildings, satellites and the laws of
-# the errors lead to, each place at the moment at which the formation is due there, by height. Near an edge the
-# worse neighbour counts. With `planner.covariance = "mapped"` the QP planner's margins follow this map along
-# its plans.
+# And what a planner can know of it beforehand: the sigma of the fix that buildings, satellites and the laws
+# of the errors lead to, each place at the moment at which the formation is due there, by height. Near an edge
+# the worse neighbour counts. With `planner.covariance = "mapped"` the QP planner's margins follow this map
+# along its plans.
 
 # %%
 with house_style():

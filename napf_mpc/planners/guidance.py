@@ -38,8 +38,7 @@ def guidance_covariance(nav: NavSolution, trusted: NDArray[np.bool_], ahead: Arr
     """Covariance (run, uav, 3, 3) for which guidance leaves room [m^2].
 
     What lies beyond the planner's horizon is passed when navigation is as certain as it will be at its end,
-    if fixes go on; with a sigma map, as uncertain as it will be anywhere on the planned way (:func:`widest`).
-    In an outage, or if nothing is expected, it is taken to be as certain as now.
+    if fixes go on. In an outage, or if nothing is expected, it is taken to be as certain as now.
 
     Parameters
     ----------
@@ -48,20 +47,13 @@ def guidance_covariance(nav: NavSolution, trusted: NDArray[np.bool_], ahead: Arr
     trusted : array of bool, shape (run, uav)
         Where it may be used; elsewhere the answer is a unit matrix.
     ahead : array, shape (run, uav, 3, 3), or None
-        Covariance expected [m^2].
+        Covariance expected at the end of the horizon [m^2].
     """
     room = nav.position_covariance
     if ahead is not None:
         fixes = nav.available if nav.forecast is None else nav.forecast.fixes
         room = np.where(fixes[..., None, None], ahead, room)
     return np.asarray(np.where(trusted[..., None, None], room, np.eye(3)))
-
-
-def widest(covariance: Array) -> Array:
-    """Of covariances (run, uav, N, 3, 3) the one (run, uav, 3, 3) with the largest total variance [m^2]."""
-    total = np.einsum("...aa->...", covariance)
-    most = total.argmax(axis=2)[..., None, None, None]
-    return np.asarray(np.take_along_axis(covariance, most, axis=2)[:, :, 0])
 
 
 class Guidance:

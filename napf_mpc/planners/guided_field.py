@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from napf_mpc import apf
 from napf_mpc.formation import reference_speed, synchronisation_error
 from napf_mpc.navigation.solution import NavSolution
-from napf_mpc.planners.guidance import Guidance, guidance_covariance, widest
+from napf_mpc.planners.guidance import Guidance, guidance_covariance
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_settings import GuidanceSettings
 from napf_mpc.planners.plan import stage_grid
@@ -72,7 +72,7 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
             ahead = nav.position_covariance_ahead(self._horizon_s, with_fixes=True)[:, :, 0]
         elif settings.covariance == "mapped":
             way = mission.speed_mps * self._times_s[:, None] * self._frame.along
-            ahead = widest(nav.position_covariance_ahead(self._times_s, True, position[:, :, None] + way))
+            ahead = nav.position_covariance_ahead(self._times_s, True, position[:, :, None] + way)[:, :, -1]
         room = guidance_covariance(nav, trusted, ahead)
         flying = None if nav.airborne is None else np.asarray(nav.airborne.any(-1))
         guide = self.guidance.step(position, room, trusted, time_s, nav.tracks, flying=flying)

@@ -24,7 +24,7 @@ from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.cohesion import drawn_together
 from napf_mpc.planners.fallback import DESCENT_MPS, Action, Codes, Ladder
 from napf_mpc.planners.guess import cut_at_obstacles
-from napf_mpc.planners.guidance import Guidance, guidance_covariance, widest
+from napf_mpc.planners.guidance import Guidance, guidance_covariance
 from napf_mpc.planners.guide import Guide
 from napf_mpc.planners.guided_field import waiting_reasons
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
@@ -214,7 +214,8 @@ class QpPlanner:
         covariance = self._covariance(nav, trusted, carried, state)
         guide = None
         if self._guidance is not None:
-            room = guidance_covariance(nav, trusted, self._room(covariance))
+            expected = self.problem.planner.covariance in ("expected", "mapped")
+            room = guidance_covariance(nav, trusted, covariance[:, :, -1] if expected else None)
             # Raw measurements jump by more than a taut way could gain.
             flying = np.asarray(airborne.any(-1))
             guide = self._guidance.step(
@@ -372,13 +373,6 @@ class QpPlanner:
         assert isinstance(self.problem.mission, FormationMission)
         way = self.problem.mission.speed_mps * self._model.times_s[:, None] * self._frame.along
         return np.asarray(state[:, :, None, POSITION] + way)
-
-    def _room(self, covariance: Array) -> Array | None:
-        """Covariance (run, uav, 3, 3) that guidance is to expect, of those at the stages; or None."""
-        asked = self.problem.planner.covariance
-        if asked == "mapped":
-            return widest(covariance)
-        return np.asarray(covariance[:, :, -1]) if asked == "expected" else None
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
