@@ -196,7 +196,7 @@ class QpPlanner:
         trusted = nav.trusted()
         state = self._state(nav, trusted)
         carried = self._carried(state, time_s)
-        covariance = self._covariance(nav, trusted, carried, state)
+        covariance = self._covariance(nav, trusted, self._planned(state, carried))
         reference, way = self._references(state, carried, nav, covariance, trusted, None)
         guess, _ = self._guess(state, way, carried, time_s)
         horizon = self._horizon(guess, covariance, nav, trusted, time_s)
@@ -211,7 +211,7 @@ class QpPlanner:
         self._anchor = np.where(trusted[..., None], nav.position, self._anchor)
         state = self._state(nav, trusted)
         carried = self._carried(state, time_s)
-        covariance = self._covariance(nav, trusted, carried, state)
+        covariance = self._covariance(nav, trusted, self._planned(state, carried))
         guide = None
         if self._guidance is not None:
             expected = self.problem.planner.covariance in ("expected", "mapped")
@@ -349,27 +349,24 @@ class QpPlanner:
             tracks=nav.tracks,
         )
 
-    def _covariance(
-        self, nav: NavSolution, trusted: Mask, carried: tuple[Array, Array] | None, state: Array
-    ) -> Array:
+    def _covariance(self, nav: NavSolution, trusted: Mask, places: Array | None = None) -> Array:
         """Covariance of the position (run, uav, N, 3, 3) at the end of each stage, as the problem asks."""
         asked = self.problem.planner.covariance
         if asked == "held":
             covariance = np.repeat(nav.position_covariance[:, :, None], self._model.stages, axis=2)
         else:
-            places = None
-            if asked == "mapped" and carried is not None:
-                places = np.ascontiguousarray(carried[0][..., POSITION])
-            elif asked == "mapped":
-                places = self._straight_ahead(state)
             fixes = asked != "propagated"
             covariance = nav.position_covariance_ahead(self._model.times_s, fixes, places)
         return (
             covariance if trusted.all() else np.where(trusted[..., None, None, None], covariance, np.eye(3))
         )
 
-    def _straight_ahead(self, state: Array) -> Array:
-        """Places (run, uav, N, 3) along the path at the reference speed, from where UAVs are."""
+    def _planned(self, state: Array, carried: tuple[Array, Array] | None) -> Array | None:
+        """Places (run, uav, N, 3) of the last plans, at first straight ahead; None without a sigma map."""
+        if self.problem.planner.covariance != "mapped":
+            return None
+        if carried is not None:
+            return np.ascontiguousarray(carried[0][..., POSITION])
         assert isinstance(self.problem.mission, FormationMission)
         way = self.problem.mission.speed_mps * self._model.times_s[:, None] * self._frame.along
         return np.asarray(state[:, :, None, POSITION] + way)
