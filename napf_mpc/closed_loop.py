@@ -24,7 +24,9 @@ from napf_mpc.navigation.filtered import FilteredNavigation
 from napf_mpc.navigation.fix import Fix, FixSource, PlacedErrors, PositionErrors, fixes_of_flight
 from napf_mpc.navigation.gnss import gnss_scene
 from napf_mpc.navigation.gnss_fixes import GnssErrors
+from napf_mpc.navigation.gnss_sigma import sigma_map
 from napf_mpc.navigation.monitor import InnovationMonitor
+from napf_mpc.navigation.sigma_map import SigmaMap
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import MovingTracker
 from napf_mpc.planners.planner import Command, Planner
@@ -63,6 +65,8 @@ class Scenario:
     """Navigation errors over the whole mission."""
     moving: MovingObstacles | None = None
     """What moves, in truth; planners see its tracks only."""
+    sigma_map: SigmaMap | None = None
+    """What a map of buildings and satellites tells planners of fixes to come; None unless they ask."""
 
 
 def formation_mission(problem: Problem) -> FormationMission:
@@ -109,13 +113,16 @@ def build_scenario(problem: Problem, seed: Seed, runs: range, data_folder: Path 
     lanes = formation_offsets(problem.formation)[:, 1]
     start = np.broadcast_to(initial_state(problem), (len(runs), problem.uav_count, 12))
     obstacles = build_scenes(problem.world, frame, lanes, seed, runs, data_folder)
+    errors = _errors(problem, seed, runs, obstacles, data_folder)
+    mapped = isinstance(errors, GnssErrors) and problem.planner.covariance == "mapped"
     return Scenario(
         seed,
         runs,
         obstacles,
         start.copy(),
-        _errors(problem, seed, runs, obstacles, data_folder),
+        errors,
         moving_obstacles(problem.world, seed, runs, problem.simulation.time_limit_s),
+        sigma_map(problem, errors.scene) if isinstance(errors, GnssErrors) and mapped else None,
     )
 
 
@@ -232,7 +239,8 @@ def closed_loop(
         if command is None or tick % clock.ticks_per_plan == 0:
             airborne = np.repeat(active[:, None], state.shape[1], axis=1)
             tracks = None if tracker is None else tracker.tracks()
-            command = planner.step(replace(nav, airborne=airborne, tracks=tracks), time_s)
+            shown = replace(nav, airborne=airborne, tracks=tracks, sigma_map=scenario.sigma_map)
+            command = planner.step(shown, time_s)
             holding[active] = command.holding[active].any(-1)
             if command.reason is not None:
                 reason[active] = command.reason[active].max(-1)

@@ -31,7 +31,7 @@ from scipy.special import ndtr
 from napf_mpc import compare, load_problem
 from napf_mpc.closed_loop import build_scenario
 from napf_mpc.formation import PathFrame, formation_offsets
-from napf_mpc.plot.sky import dop_map_figure, sky_figure
+from napf_mpc.plot.sky import dop_map_figure, sigma_map_figure, sky_figure
 from napf_mpc.plot.style import BLUE, GREEN, GREY, VERMILION, house_style
 
 # %matplotlib inline
@@ -63,6 +63,17 @@ figure
 # %%
 with house_style():
     figure = dop_map_figure(problem, scene, 20.0, cells=80)
+figure
+
+# %% [markdown]
+# And what a planner can know of it beforehand: the sigma of the fix that buildings, satellites and the laws
+# of the errors lead to, each place at the moment at which the formation is due there, by height. Near an edge
+# the worse neighbour counts. With `planner.covariance = "mapped"` the QP planner's margins follow this map
+# along its plans.
+
+# %%
+with house_style():
+    figure = sigma_map_figure(problem, scene)
 figure
 
 # %% [markdown]

@@ -3,7 +3,8 @@ r"""How certain of its position the navigation filter will be: its covariance ca
 A Kalman filter's covariance does not depend on what is measured, so the filter can say beforehand how certain
 it will be: :func:`variance_ahead` carries the ten numbers of each axis (:mod:`napf_mpc.navigation.kalman`)
 from tick to tick as the filter would, either as if no fix came any more, or with the fixes that are to be
-expected: at the epochs at which they come now, with the sigma that they report now, if they are in use now.
+expected: at the epochs at which they come now, with the sigma that they report now, if they are in use now;
+or with the sigmas that a map has at the places to come (:mod:`.sigma_map`).
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class CovarianceForecast:
     epochs_per_new: int = 1
     """Epochs from one new fix to the next."""
 
-    def variance(self, ahead_s: Array, with_fixes: bool) -> Array:
+    def variance(self, ahead_s: Array, with_fixes: bool, fix_sigma: Array | None = None) -> Array:
         """Variance of the position (run, uav, N, 3) on each axis at times from now [m^2].
 
         Parameters
@@ -95,14 +96,17 @@ class CovarianceForecast:
             Times from now, >= 0 and increasing, taken to the nearest tick [s].
         with_fixes : bool
             Whether fixes and a barometer go on measuring as they do now, or nothing does.
+        fix_sigma : array, shape (run, uav, N, 3), optional
+            Sigmas of the fixes up to each of the times, instead of those of now, infinite for none [m].
         """
         model = self.model
+        fixes = self.fixes if fix_sigma is None else np.ones_like(self.fixes)
         ticks = np.rint(np.asarray(ahead_s) / model.period_s).astype(np.int64)
         out = np.empty((*self.fixes.shape, len(ticks), 3))
         variance_ahead(
             self.packed,
-            self.sigma,
-            self.fixes & with_fixes,
+            self.sigma[:, :, None] if fix_sigma is None else fix_sigma,
+            fixes & with_fixes,
             model.fixless_axis & with_fixes,
             ticks,
             model.drift,
@@ -117,12 +121,12 @@ class CovarianceForecast:
         )
         return out
 
-    def change(self, ahead_s: Array, with_fixes: bool) -> Array:
+    def change(self, ahead_s: Array, with_fixes: bool, fix_sigma: Array | None = None) -> Array:
         """Factor (run, uav, N, 3) from the variance now to that of then; 1, held, where there is none.
 
         Parameters are those of :meth:`variance`.
         """
-        factor = self.variance(ahead_s, with_fixes)
+        factor = self.variance(ahead_s, with_fixes, fix_sigma)
         _compare(self.packed, factor)
         return factor
 
@@ -161,8 +165,8 @@ def variance_ahead(
 
     Parameters
     ----------
-    packed, sigma : array, shapes (run, uav, 3, 10) and (run, uav, 3)
-        Covariances now, and sigma of a fix [m].
+    packed, sigma : array, shapes (run, uav, 3, 10) and (run, uav, N or 1, 3)
+        Covariances now, and sigma of a fix up to each tick, or up to all of them [m].
     fixes : array of bool, shape (run, uav)
         Whether fixes go on.
     fixless_axis : array of bool, shape (3,)
@@ -188,9 +192,11 @@ def variance_ahead(
             for a in range(3):
                 for e in range(kalman.PACKED):
                     c[a, e] = packed[r, i, a, e]
-                usable[a] = 0.0 < sigma[r, i, a] < np.inf
             now, to_epoch, to_new = 0, ticks_to_epoch, epochs_to_new
             for k in range(ticks.shape[0]):
+                at = min(k, sigma.shape[2] - 1)
+                for a in range(3):
+                    usable[a] = 0.0 < sigma[r, i, at, a] < np.inf
                 while now < ticks[k]:
                     n = min(ticks[k] - now, to_epoch)
                     for a in range(3):
@@ -205,7 +211,7 @@ def variance_ahead(
                     for a in range(3):
                         _forget(c, a, error_memory[a], error_noise[a])
                         if usable[a] and (fix or fixless_axis[a]):
-                            _measured(c, a, 1.0, 0.0, sigma[r, i, a], position_noise)
+                            _measured(c, a, 1.0, 0.0, sigma[r, i, at, a], position_noise)
                         if usable[a] and fix:
                             _measured(c, a, 0.0, 1.0, 0.0, velocity_noise)
                     if to_new == 0:

@@ -162,6 +162,33 @@ class GnssScene:
         sigma = np.where(tracked, self.believed_sigma(unit, strength), 0.0)
         return Observation(unit, in_sight, tracked, strength, error, sigma, shared)
 
+    def expect(self, time_s: float, position: Array) -> Observation:
+        """Expect at places and a time what the map, the almanac and the laws say, and nothing that is drawn.
+
+        A signal in sight is expected with its usual C/N0, a hidden one with that less the mean loss by
+        reflection; what then is under the mask is not counted on. Errors are zero: they are not known.
+
+        Parameters
+        ----------
+        time_s : float
+            Time since the start of the mission [s].
+        position : array, shape (run, place, 3)
+            Any places [m].
+        """
+        cfg = self.config
+        unit = self.directions(time_s)
+        elevation = elevation_rad(unit)
+        above = elevation >= math.radians(cfg.elevation_mask_deg)
+        elevation = np.where(above, elevation, 0.5 * math.pi)
+        in_sight = line_of_sight(self.obstacles, position, unit, above)
+        usual = carrier_to_noise_dbhz(elevation, *cfg.carrier_to_noise_dbhz)[:, None]
+        expected = np.where(in_sight, usual, usual - cfg.reflected_loss_db)
+        tracked = above[:, None] & (expected >= cfg.carrier_to_noise_mask_dbhz)
+        strength = np.where(tracked, expected, 0.0)
+        sigma = np.where(tracked, self.believed_sigma(unit, strength), 0.0)
+        shared = _length(self._shared_parts(elevation))
+        return Observation(unit, in_sight, tracked, strength, np.zeros(strength.shape), sigma, shared)
+
     def believed_sigma(self, unit: Array, carrier_to_noise: Array) -> Array:
         """Sigma of ranges as the receiver believes, from what it knows (run, uav, sat) [m].
 

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled, compiled_bare
+from napf_mpc.navigation.fix import coasting_variance
 from napf_mpc.navigation.forecast import CovarianceForecast
 from napf_mpc.navigation.integrity.overbound import Overbound
+from napf_mpc.navigation.sigma_map import SigmaMap
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.vehicle.plant import plain
 
@@ -59,6 +61,8 @@ class NavSolution:
     nothing watches."""
     lasting: Array | None = None
     """(run, uav, 3, 3) part of the position's covariance that nothing measured reduces [m^2]; or None."""
+    sigma_map: SigmaMap | None = None
+    """Certainty of fixes by place; None if there is no map of it."""
 
     @property
     def position_covariance(self) -> Array:
@@ -77,10 +81,13 @@ class NavSolution:
         sigma = self.position_covariance
         return np.asarray(sigma[:, i] + sigma[:, j] - cross - cross.transpose(0, 2, 1))
 
-    def position_covariance_ahead(self, ahead_s: Array, with_fixes: bool) -> Array:
+    def position_covariance_ahead(
+        self, ahead_s: Array, with_fixes: bool, places: Array | None = None
+    ) -> Array:
         """Covariance of the position at times from now: that of now, each axis with the variance of then.
 
-        Correlations between axes are held. Without a forecast all is.
+        Correlations between axes are held. Without a forecast all is, but for what the sigma map says of the
+        places to come; there, without a fix, the last one's covariance grows as everywhere.
 
         Parameters
         ----------
@@ -88,12 +95,16 @@ class NavSolution:
             Times from now, >= 0 and increasing [s].
         with_fixes : bool
             Whether fixes go on as they come now, or none does.
+        places : array, shape (run, uav, N, 3), optional
+            Where the UAVs will be then, for the sigma map [m].
 
         Returns
         -------
         array, shape (run, uav, N, 3, 3)
             [m^2].
         """
+        if with_fixes and places is not None and self.sigma_map is not None:
+            return self._covariance_at(self.sigma_map, ahead_s, places)
         if self.forecast is None:
             return np.repeat(self.position_covariance[:, :, None], len(ahead_s), axis=2)
         change = self.forecast.change(ahead_s, with_fixes)
@@ -105,6 +116,33 @@ class NavSolution:
         waning[..., :3, :3] -= self.lasting
         _stretch(plain(waning), change, out)
         out += self.lasting[:, :, None]
+        return out
+
+    def _covariance_at(self, sigma_map: SigmaMap, ahead_s: Array, places: Array) -> Array:
+        """Covariance (run, uav, N, 3, 3) at times from now and the places of then, by the map [m^2]."""
+        out = np.empty((*places.shape, 3))
+        if self.forecast is None:
+            whole = np.einsum("...aa->...a", self.position_covariance)
+            (at_places,) = sigma_map.ahead([whole], self.available, self.position, places)
+            then, age = _carried_on(whole, at_places, ahead_s)
+            now = np.where(whole > 0.0, whole, np.inf)[:, :, None]
+            _stretch(plain(self.covariance), (then + coasting_variance(age)) / now, out)
+            return out
+        forecast = self.forecast
+        lasts = np.zeros(places[:, :, 0].shape)
+        if self.lasting is not None:
+            lasts = np.einsum("...aa->...a", self.lasting)
+        own, lasting = sigma_map.ahead([forecast.sigma**2, lasts], forecast.fixes, self.position, places)
+        waning = self.covariance.copy()
+        if self.lasting is not None:
+            waning[..., :3, :3] -= self.lasting
+        _stretch(plain(waning), forecast.change(ahead_s, True, np.sqrt(own)), out)
+        if self.lasting is not None:
+            then, _ = _carried_on(lasts, lasting, ahead_s)
+            share = np.empty_like(out)
+            held = np.where(lasts > 0.0, lasts, np.inf)[:, :, None]
+            _stretch(plain(self.lasting), np.where(np.isinf(held), 1.0, then / held), share)
+            out += share
         return out
 
     def trusted(self) -> NDArray[np.bool_]:
@@ -119,6 +157,21 @@ class NavSolution:
             plain(self.covariance), trusted,
         )  # fmt: skip
         return np.asarray(self.available & trusted)
+
+
+def _carried_on(now: Array, then: Array, ahead_s: Array) -> tuple[Array, Array]:
+    """Variances (run, uav, N, 3), those of the last fix where there is none, and the age of that fix [s]."""
+    age = np.zeros(then.shape)
+    if not np.isinf(then).any():
+        return then, age
+    then = then.copy()
+    before, waited, moment = now, np.zeros(now.shape), 0.0
+    for n, ahead in enumerate(ahead_s):
+        none = np.isinf(then[:, :, n])
+        waited = np.where(none, waited + (ahead - moment), 0.0)
+        before = then[:, :, n] = np.where(none, before, then[:, :, n])
+        age[:, :, n], moment = waited, ahead
+    return then, age
 
 
 @compiled_bare

@@ -49,8 +49,8 @@ def guidance_covariance(nav: NavSolution, trusted: NDArray[np.bool_], ahead: Arr
         Covariance expected at the end of the horizon [m^2].
     """
     room = nav.position_covariance
-    if ahead is not None and nav.forecast is not None:
-        fixes = nav.forecast.fixes
+    if ahead is not None:
+        fixes = nav.available if nav.forecast is None else nav.forecast.fixes
         room = ahead if fixes.all() else np.where(fixes[..., None, None], ahead, room)
     return room if trusted.all() else np.where(trusted[..., None, None], room, np.eye(3))
 

@@ -54,6 +54,7 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         grid = stage_grid(1.0 / planner.rate_hz, planner.horizon, planner.look_ahead_s)
         # Of the QP planner: both leave the same room.
         self._horizon_s = np.array([grid.sum()])
+        self._times_s = np.cumsum(grid)
 
     def reset(self, obstacles: ObstacleSet, runs: int) -> None:
         """Take a new map and forget all plans."""
@@ -69,6 +70,9 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         ahead = None
         if settings.covariance == "expected":
             ahead = nav.position_covariance_ahead(self._horizon_s, with_fixes=True)[:, :, 0]
+        elif settings.covariance == "mapped":
+            way = mission.speed_mps * self._times_s[:, None] * self._frame.along
+            ahead = nav.position_covariance_ahead(self._times_s, True, position[:, :, None] + way)[:, :, -1]
         room = guidance_covariance(nav, trusted, ahead)
         flying = None if nav.airborne is None else np.asarray(nav.airborne.any(-1))
         guide = self.guidance.step(position, room, trusted, time_s, nav.tracks, flying=flying)

@@ -207,7 +207,7 @@ class QpPlanner:
         trusted = nav.trusted()
         state = self._state(nav, trusted)
         carried = self._carried(state, time_s)
-        covariance = self._covariance(nav, trusted)
+        covariance = self._covariance(nav, trusted, self._planned(state, carried))
         reference, way = self._references(state, carried, nav, covariance, trusted, None)
         guess, _ = self._guess(state, way, carried, time_s)
         horizon = self._horizon(guess, covariance, nav, trusted, time_s)
@@ -225,17 +225,17 @@ class QpPlanner:
             placed = trusted | np.isfinite(nav.position).all(-1)
         np.copyto(self._anchor, nav.position, where=placed[..., None])
         state = self._state(nav, trusted)
-        covariance = self._covariance(nav, trusted)
+        carried = self._carried(state, time_s)
+        covariance = self._covariance(nav, trusted, self._planned(state, carried))
         guide = None
         if self._guidance is not None:
-            expected = self.problem.planner.covariance == "expected"
+            expected = self.problem.planner.covariance in ("expected", "mapped")
             room = guidance_covariance(nav, trusted, covariance[:, :, -1] if expected else None)
             # Raw measurements jump by more than a taut way could gain.
             flying = np.asarray(airborne.any(-1))
             guide = self._guidance.step(
                 state[..., POSITION], room, trusted, time_s, taut=nav.filtered, flying=flying
             )
-        carried = self._carried(state, time_s)
         reference, way = self._references(state, carried, nav, covariance, trusted, guide)
         began = 0.0 if self._clock is None else self._clock()
         guess = self._guess(state, way, carried, time_s)
@@ -382,16 +382,27 @@ class QpPlanner:
             tracks=nav.tracks,
         )
 
-    def _covariance(self, nav: NavSolution, trusted: Mask) -> Array:
+    def _covariance(self, nav: NavSolution, trusted: Mask, places: Array | None = None) -> Array:
         """Covariance of the position (run, uav, N, 3, 3) at the end of each stage, as the problem asks."""
         asked = self.problem.planner.covariance
         if asked == "held":
             covariance = np.repeat(nav.position_covariance[:, :, None], self._model.stages, axis=2)
         else:
-            covariance = nav.position_covariance_ahead(self._model.times_s, with_fixes=asked == "expected")
+            fixes = asked != "propagated"
+            covariance = nav.position_covariance_ahead(self._model.times_s, fixes, places)
         return (
             covariance if trusted.all() else np.where(trusted[..., None, None, None], covariance, np.eye(3))
         )
+
+    def _planned(self, state: Array, carried: tuple[Array, Array] | None) -> Array | None:
+        """Places (run, uav, N, 3) of the last plans, at first straight ahead; None without a sigma map."""
+        if self.problem.planner.covariance != "mapped":
+            return None
+        if carried is not None:
+            return np.ascontiguousarray(carried[0][..., POSITION])
+        assert isinstance(self.problem.mission, FormationMission)
+        way = self.problem.mission.speed_mps * self._model.times_s[:, None] * self._frame.along
+        return np.asarray(state[:, :, None, POSITION] + way)
 
     def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""

@@ -13,6 +13,7 @@ from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from napf_mpc.closed_loop import build_scenario, formation_mission
@@ -20,6 +21,7 @@ from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.navigation.gnss import GnssScene
 from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.gnss_map import gnss_map
+from napf_mpc.navigation.gnss_sigma import sigma_map
 from napf_mpc.navigation.sky import azimuth_rad, elevation_rad
 from napf_mpc.plot.scene import plan_outline
 from napf_mpc.plot.style import (
@@ -47,6 +49,7 @@ _MARKS = ("o", "s", "^")  # by system
 _STEP_DEG = 1.0
 _MARGIN_M = 60.0
 _MOST_DOP = 10.0
+_MOST_SIGMA_M = 10.0
 
 
 def sky_figure(problem: Problem, scene: GnssScene, places: Sequence[Array], titles: Sequence[str]) -> Figure:
@@ -199,13 +202,69 @@ def dop_map_figure(problem: Problem, scene: GnssScene, height_m: float, cells: i
     return page.figure
 
 
-def _draw_houses(axes: Axes, obstacles: ObstacleSet, height_m: float) -> None:
-    """What reaches above a height, filled; lower houses hide nothing there."""
+def sigma_map_figure(problem: Problem, scene: GnssScene) -> Figure:
+    """Horizontal sigma of the fix to be expected along the path, a panel for each slice of the sigma map.
+
+    Parameters
+    ----------
+    problem : Problem
+        Formation problem: path, and the credit.
+    scene : GnssScene
+        Of its run 0.
+    """
+    mission = formation_mission(problem)
+    made = sigma_map(problem, scene.of_run(0, _run_0(scene)))
+    variance = made.nodes[0, ..., 0:2].sum(-1) + made.nodes[0, ..., 3:5].sum(-1)
+    sigma = np.minimum(np.sqrt(variance), _MOST_SIGMA_M)
+    low, high = made.low_m, made.low_m + made.cell_m * (np.array(sigma.shape) - 1)
+    width = 5.9
+    tall = width * (high[1] - low[1]) / (high[0] - low[0])
+    slices = len(made.heights_m)
+    page = Page.of_size(PAGE_IN, 0.42 + slices * (tall + 0.3), credit_of(problem))
+    least, most = float(sigma.min()), float(sigma.max())
+    norm = LogNorm(least, most)
+    around = Affine2D().translate(*-made.frame.origin[:2]).rotate(-made.frame.heading_rad)
+    lanes = formation_offsets(problem.formation)[:, 1]
+    for n, above in enumerate(made.heights_m):
+        height = float(made.frame.origin[2] + above)
+        bottom = 0.42 + n * (tall + 0.3)
+        axes = page.axes(0.55, bottom, width, tall)
+        half = 0.5 * made.cell_m
+        extent = (low[0] - half[0], high[0] + half[0], low[1] - half[1], high[1] + half[1])
+        image = axes.imshow(
+            sigma[:, :, n].T, origin="lower", extent=extent, cmap="viridis_r", norm=norm,
+            interpolation="nearest", zorder=0.0,
+        )  # fmt: skip
+        _draw_houses(axes, _run_0(scene), height, around)
+        for lane in lanes:
+            axes.plot([0.0, mission.length_m], [lane, lane], color=BLACK, linewidth=0.7, linestyle="--")
+        axes.set(xlim=extent[:2], ylim=extent[2:], ylabel="Left (m)", aspect="equal")
+        axes.set_title(f"{height:.0f} m above ground")
+        if n == 0:
+            axes.set_xlabel("Along the path (m)")
+        else:
+            axes.tick_params(labelbottom=False)
+    whole = slices * (tall + 0.3) - 0.3
+    bar = page.figure.colorbar(image, cax=page.axes(0.55 + width + 0.1, 0.42, 0.09, whole))
+    bar.outline.set_linewidth(0.6)
+    ticks = [
+        tick for tick in (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, _MOST_SIGMA_M) if least <= tick <= most
+    ]
+    bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+    bar.minorticks_off()
+    bar.set_label("Horizontal sigma (m)")
+    return page.figure
+
+
+def _draw_houses(axes: Axes, obstacles: ObstacleSet, height_m: float, around: Affine2D | None = None) -> None:
+    """What reaches above a height, filled, and moved as asked; lower houses hide nothing there."""
     _, upper = obstacles.boxes
     for i, shape in enumerate(obstacles.shapes()):
         if upper[i, 2] > height_m:
             outline = plan_outline(shape)
             outline.set(facecolor=PALE, edgecolor=RULE, linewidth=0.4, zorder=1.0)
+            if around is not None:
+                outline.set_transform(around + axes.transData)
             axes.add_patch(outline)
 
 

@@ -74,8 +74,8 @@ class Planner(Section):
     """With ``risk_per_mission``: time for which each UAV has an obstacle at its margin, in all."""
     risk_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
     """With ``risk_per_mission``: correlation time of the position's error; by default navigation's own."""
-    covariance: Literal["held", "expected", "propagated"] = "expected"
-    """QP planner: over the horizon, the covariance reported now; what the filter expects if fixes go on as now; or if none comes any more. Guidance leaves room for what is expected at the horizon's end, or for the one now."""  # noqa: E501
+    covariance: Literal["held", "expected", "mapped", "propagated"] = "expected"
+    """QP planner: over the horizon, the covariance reported now; what the filter expects if fixes go on as now; with fixes as a sigma map has them at the planned places (navigation.kind "gnss"); or if none comes any more. Guidance leaves room for what is expected at the horizon's end, or for the one now."""  # noqa: E501
     inflation: Literal["shift", "range"] = "shift"
     """k sigma shifts the distance to the obstacle, or only widens the range of influence."""
     sigma: Literal["directional", "largest", "rms", "chi2"] = "directional"

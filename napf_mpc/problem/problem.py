@@ -93,6 +93,11 @@ class Problem(Section):
                 f'navigation.monitor = "{navigation.monitor}" watches a filter\'s innovations: set '
                 'navigation.filter = "kalman"'
             ]
+        if self.planner.covariance == "mapped" and not isinstance(navigation, Gnss):
+            return [
+                'planner.covariance = "mapped" follows the satellites in sight of navigation.kind = "gnss": '
+                f'navigation.kind = "{navigation.kind}" has none; use covariance = "expected"'
+            ]
         if self.planner.safety == "overbound":
             if not isinstance(navigation, Recorded):
                 return [

@@ -15,6 +15,7 @@ from napf_mpc.planners.guidance import guidance_covariance
 from napf_mpc.planners.guide import Guide
 from napf_mpc.planners.guided_field import GuidedNapfPlanner
 from napf_mpc.planners.mpc import QpPlanner, default_constraints
+from napf_mpc.planners.plan import stage_grid
 from napf_mpc.planners.planner import Command
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
@@ -104,6 +105,71 @@ def test_guidance_leaves_room_for_the_sigma_that_is_expected_at_the_end_of_the_h
         np.testing.assert_allclose(share, 0.76, atol=0.02)
     else:
         np.testing.assert_allclose(share, 1.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["qp", "napf_guided"])
+def test_with_a_sigma_map_guidance_leaves_room_for_the_place_at_the_end_of_the_planned_way(
+    kind: str,
+) -> None:
+    """Into the street: the walls ahead take satellites, and the room is for what they leave, in metres."""
+    flown = load_problem(
+        "street_canyon_gnss",
+        {"planner.covariance": "mapped", "planner.kind": kind, "simulation.time_limit_s": 4.0},
+    )
+    planner = QpPlanner(flown) if kind == "qp" else GuidedNapfPlanner(flown)
+    guidance = planner._guidance if isinstance(planner, QpPlanner) else planner.guidance
+    assert guidance is not None
+    room: list[Array] = []
+    given: list[NavSolution] = []
+    step, fly = guidance.step, planner.step
+
+    def guided(position: Array, covariance: Array, *others: object, **named: object) -> Guide:
+        room.append(covariance)
+        return step(position, covariance, *others, **named)  # type: ignore[arg-type]
+
+    def flying(solution: NavSolution, time_s: float) -> Command:
+        given.append(solution)
+        return fly(solution, time_s)
+
+    guidance.step = guided  # type: ignore[method-assign, assignment]
+    planner.step = flying  # type: ignore[method-assign]
+    simulate(flown, planner, seed=3, runs=2)
+    # The first step has no plan yet: straight ahead at 2 m/s for 6.5 s, fixes with the sigmas on the way.
+    nav, times = given[0], np.cumsum(stage_grid(0.1, 20, 6.5))
+    assert nav.sigma_map is not None
+    heading = np.radians(30.0)
+    way = 2.0 * times[:, None] * np.array([np.cos(heading), np.sin(heading), 0.0])
+    ahead = nav.position_covariance_ahead(times, True, nav.position[:, :, None] + way)
+    np.testing.assert_allclose(room[0], ahead[:, :, -1], rtol=1e-9)
+    share = np.einsum("truaa->tru", np.array(room)) / [
+        np.einsum("...aa->...", nav.position_covariance) for nav in given
+    ]
+    sigma = np.sqrt(share)
+    assert sigma.max() > 1.1  # somebody is to lose satellites
+    assert sigma.min() > 0.4
+
+
+def test_the_horizons_covariance_is_that_of_the_planned_places_on_the_map() -> None:
+    flown = load_problem(
+        "street_canyon_gnss", {"planner.covariance": "mapped", "simulation.time_limit_s": 4.0}
+    )
+    seen: list[Horizon] = []
+    planner = watched(flown, seen.append)
+    given: list[NavSolution] = []
+    fly = planner.step
+
+    def flying(solution: NavSolution, time_s: float) -> Command:
+        given.append(solution)
+        return fly(solution, time_s)
+
+    planner.step = flying  # type: ignore[method-assign]
+    simulate(flown, planner, seed=3, runs=2)
+    times = np.cumsum(seen[-1].step_s)
+    without = given[-1].position_covariance_ahead(times, True)
+    at_places = given[-1].position_covariance_ahead(times, True, seen[-1].position)
+    np.testing.assert_allclose(seen[-1].covariance, at_places, rtol=0.05)
+    apart = np.sqrt(np.einsum("...aa->...a", seen[-1].covariance / without))
+    assert np.abs(apart - 1.0).max() > 0.05
 
 
 def test_in_an_outage_guidance_leaves_room_for_the_sigma_now() -> None:
