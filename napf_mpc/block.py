@@ -187,7 +187,7 @@ def _event(alarm: MonitorEvent) -> Event:
 _TURNS = {
     "begins": ("fixes disagree with the estimate", "hold"),
     "ends": ("fixes agree with the estimate again", "fly on"),
-    "given in": ("fixes disagree, and the estimate is worth nothing", "begin anew with the fix"),
+    "given in": ("fixes disagree for too long", "begin anew with the fix"),
 }
 
 

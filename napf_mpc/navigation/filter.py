@@ -23,7 +23,8 @@ are two witnesses, and one of them may be right when the other is not.
    error is forgotten.
 5. The dispute ends with a step that brings the fix inside the gate, or once fixes have been within
    :data:`CALM_SIGMAS` for :data:`CALM_S`. If the estimate's own sigma passes ``filter_coast_sigma_m`` first,
-   the filter begins anew with the fix, its sigma at least their distance.
+   or the dispute lasts longer than ``dispute_limit_s``, the filter begins anew with the fix, its sigma at
+   least their distance.
 
 The axes are filtered apart. Where a fix reports a covariance between axes, that is not used to estimate, but
 carried through the gains that are, so the reported covariance has it.
@@ -99,6 +100,8 @@ class FilterModel:
     """Largest sigma of an axis with which a solution without a fix counts as available [m]."""
     monitored: bool = False
     """Whether innovations are watched, and sigmas that are too small scaled."""
+    dispute_limit_s: float = math.inf
+    """Watched: how long fixes and estimate may be in dispute before it begins anew with the fix [s]."""
 
     @classmethod
     def of_navigation(cls, navigation: Navigation, period_s: float, ticks_per_epoch: int) -> FilterModel:
@@ -135,6 +138,7 @@ class FilterModel:
             gate=navigation.innovation_gate_sigma,
             coast_sigma_m=navigation.filter_coast_sigma_m,
             monitored=navigation.monitor == "innovations",
+            dispute_limit_s=math.inf if navigation.dispute_limit_s is None else navigation.dispute_limit_s,
         )
 
     def forecast(self) -> ForecastModel:
@@ -318,12 +322,15 @@ class KalmanFilter:
     def _gives_in(self) -> Mask:
         """(run, uav): who begins anew with the next fix, after many that the gate refused.
 
-        Unwatched, after its patience. With the monitor only when the estimate has become worth nothing.
+        Unwatched, after its patience. With the monitor when the dispute has lasted too long, or the estimate
+        has become worth nothing.
         """
         late = self._refused_s >= GATE_PATIENCE_S - 1e-9
         if self._monitor is None:
             return late
-        return np.asarray(late & ~(self._packed[..., 0].max(-1) <= self._model.coast_sigma_m**2))
+        worthless = ~(self._packed[..., 0].max(-1) <= self._model.coast_sigma_m**2)
+        too_long = self._refused_s >= GATE_PATIENCE_S + self._model.dispute_limit_s - 1e-9
+        return np.asarray(late & (worthless | too_long))
 
     def _bar_repeated(self, position: Array, velocity: Array) -> None:
         """Refuse fixes that stand still while their own velocity says that the UAV moves."""

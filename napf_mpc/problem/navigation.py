@@ -37,6 +37,8 @@ class _NavigationBase(Section):
     """Filter: correlation time that it assumes of the fix's error; by default the error's own."""
     filter_coast_sigma_m: float = Field(10.0, ge=1e-3, le=1e4)
     """Filter: without a fix, the solution counts as available up to this sigma of an axis."""
+    dispute_limit_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
+    """Filter with the monitor: when fixes and estimate have been in dispute this long, it begins anew with the fix; by default it does not while its own sigma is below ``filter_coast_sigma_m`` (docs/integrity.md)."""  # noqa: E501
 
 
 class GaussMarkov(_NavigationBase):

@@ -27,8 +27,11 @@ class Flown:
         velocity: Offset | None = None,
         monitor: str = "innovations",
         sigma_m: float = 1.0,
+        limit_s: float | None = None,
     ) -> None:
-        navigation = GaussMarkov.model_validate({"filter": "kalman", "monitor": monitor})
+        navigation = GaussMarkov.model_validate(
+            {"filter": "kalman", "monitor": monitor, "dispute_limit_s": limit_s}
+        )
         self.filter = KalmanFilter(FilterModel.of_navigation(navigation, PERIOD_S, 1), 1, 1)
         one, all_of = np.ones(1, dtype=bool), np.ones((1, 1), dtype=bool)
         self.time_s, self.error, self.sigma, self.available = [], [], [], []
@@ -94,6 +97,16 @@ def test_without_a_witness_the_estimate_is_given_up_when_it_is_worth_nothing() -
     assert flown.sigma[flown.at(when)] >= 29.0
     assert flown.filter.monitor is not None
     assert flown.filter.monitor.events[-1].axis == 1
+
+
+def test_a_dispute_may_have_a_limit() -> None:
+    """After 3 s of refused fixes and 8 s of dispute the fix is believed, and sigma covers both stories."""
+    flown = Flown(40.0, jump(10.0), limit_s=8.0)
+    assert flown.turns == [(12.9, "begins"), (21.0, "given in")]
+    assert not any(flown.available[flown.at(13.0) : flown.at(20.9)])
+    assert flown.available[flown.at(21.0)]
+    assert flown.sigma[flown.at(21.0)] >= 10.0
+    assert flown.error[-1] > 9.0
 
 
 def test_fixes_that_stay_near_for_long_are_used_again() -> None:
