@@ -1,4 +1,4 @@
-"""Where the sky is open: satellites in sight, dilution of precision and reported sigma over the ground."""
+"""Where the sky is open: satellites in sight, dilution of precision, sigma and levels over the ground."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation.gnss import GnssScene
+from napf_mpc.navigation.gnss_levels import levels_of
 from napf_mpc.navigation.pseudorange_solution import Check, SolverSettings, solve
 from napf_mpc.navigation.range_errors import carrier_to_noise_dbhz
 from napf_mpc.navigation.sky import elevation_rad
@@ -37,6 +38,10 @@ class GnssMap:
     covariance: Array
     """(y, x, 3, 3) that a receiver reports which has those and no reflected signal [m^2]; infinite without a
     position."""
+    protection_m: Array
+    """(y, x, 2) HPL and VPL that its signals allow if their strengths are as expected and no error raises an
+    alarm [m]; infinite where there is no level. Hidden signals that are strong enough count with their
+    chance of being reflections."""
 
 
 def gnss_map(
@@ -61,7 +66,7 @@ def gnss_map(
     grid = np.stack([*np.meshgrid(east_m, north_m), np.full((len(north_m), len(east_m)), height_m)], axis=-1)
     places = grid.reshape(-1, 3)
     one = scene.of_run(run, obstacles)
-    seen, dop, covariance = [], [], []
+    seen, dop, covariance, level = [], [], [], []
     for first in range(0, len(places), _BLOCK):
         part = places[first : first + _BLOCK][None]
         quiet = np.zeros((1, part.shape[1], len(scene.names)))
@@ -78,6 +83,7 @@ def gnss_map(
         seen.append(free.sum(-1).astype(np.float64))
         dop.append(found.dop)
         covariance.append(np.where(none[:, None, None], np.inf, found.covariance))
+        level.append(levels_of(one.expect(time_s, part), one).level_m)
     inside = obstacles.signed_distance(places[None])[0] <= 0.0
     shape = grid.shape[:2]
     dops = np.where(inside[:, None], np.nan, np.concatenate(dop))
@@ -88,4 +94,5 @@ def gnss_map(
         dops[:, 0].reshape(shape),
         dops[:, 1].reshape(shape),
         np.where(inside[:, None, None], np.nan, np.concatenate(covariance)).reshape(*shape, 3, 3),
+        np.where(inside[:, None], np.nan, np.concatenate(level)).reshape(*shape, 2),
     )

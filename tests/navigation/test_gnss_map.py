@@ -44,3 +44,11 @@ def test_under_an_open_sky_it_is_the_dilution_of_all_satellites() -> None:
     assert np.sqrt(made.covariance[0, 0, 2, 2]) == pytest.approx(2.5 * made.vdop[0, 0], rel=0.5)
     other = gnss_map(drawn, 0, EAST, NORTH, 5.0)
     assert other.hdop[0, 0] != made.hdop[0, 0]
+
+
+def test_it_holds_the_protection_levels_that_a_place_allows() -> None:
+    made = gnss_map(scene(HOUSE), 1, EAST, NORTH, 5.0).protection_m
+    free = gnss_map(scene(ObstacleSet.empty()), 1, EAST, NORTH, 5.0).protection_m
+    assert np.isnan(made[0, 1]).all()  # in the house
+    assert (made[0, 0] > free[0, 0]).all()  # beside it, perhaps none at all
+    assert ((free > 5.0) & (free < 40.0)).all()  # metres, at P_HMI = 1e-3
