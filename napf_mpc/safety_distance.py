@@ -176,7 +176,11 @@ class Inflation:
         if self.safety == "overbound":
             if nav.overbound is None:
                 raise ProblemError(
-                    "planner.safety", ['= "overbound": this navigation knows none; use "k_sigma"']
+                    "planner.safety",
+                    [
+                        '"overbound" needs a log to be fitted to, which this navigation has not: use '
+                        'navigation.kind = "recorded" with part = "first_half" or "second_half", or "k_sigma"'
+                    ],
                 )
             grown = np.ones(6)
             grown[:3] = nav.overbound.factors(self.k)
@@ -188,7 +192,10 @@ class Inflation:
         if nav.protection is None:
             raise ProblemError(
                 "planner.safety",
-                ['= "protection_level": this navigation computes none; use "k_sigma" or "overbound"'],
+                [
+                    '"protection_level" is not computed by this navigation: use navigation.kind = "gnss" with '
+                    'integrity = "araim", or "k_sigma"'
+                ],
             )
         known = np.asarray((np.isfinite(nav.protection) & (nav.protection > 0.0)).all(-1))
         level = np.where(known[..., None], nav.protection, 1.0) / self.k
