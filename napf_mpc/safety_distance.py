@@ -193,8 +193,8 @@ class Inflation:
             raise ProblemError(
                 "planner.safety",
                 [
-                    '"protection_level" is not computed by this navigation: use navigation.kind = "gnss" with '
-                    'integrity = "araim", or "k_sigma"'
+                    '"protection_level" is not computed by this navigation: use navigation.kind = "gnss" '
+                    'with integrity = "araim", or "k_sigma"'
                 ],
             )
         known = np.asarray((np.isfinite(nav.protection) & (nav.protection > 0.0)).all(-1))

@@ -105,7 +105,7 @@ def test_without_a_protection_level_nothing_bounds_the_error(level: float) -> No
     [("overbound", 'kind = "recorded" with part'), ("protection_level", 'kind = "gnss" with integrity')],
 )
 def test_navigation_that_does_not_tell_is_an_error(safety: Any, way_out: str) -> None:
-    with pytest.raises(ProblemError, match=f'planner.safety: "{safety}" .* {way_out} .* or "k_sigma"'):
+    with pytest.raises(ProblemError, match=f'planner.safety: "{safety}" .*{way_out}.* or "k_sigma"'):
         Inflation(3.0, safety=safety).informed(solution())
 
 
