@@ -114,7 +114,7 @@ def build_scenario(problem: Problem, seed: Seed, runs: range, data_folder: Path 
     start = np.broadcast_to(initial_state(problem), (len(runs), problem.uav_count, 12))
     obstacles = build_scenes(problem.world, frame, lanes, seed, runs, data_folder)
     errors = _errors(problem, seed, runs, obstacles, data_folder)
-    mapped = isinstance(errors, GnssErrors) and problem.planner.covariance == "mapped"
+    mapped = problem.planner.covariance == "mapped"
     return Scenario(
         seed,
         runs,
@@ -122,7 +122,7 @@ def build_scenario(problem: Problem, seed: Seed, runs: range, data_folder: Path 
         start.copy(),
         errors,
         moving_obstacles(problem.world, seed, runs, problem.simulation.time_limit_s),
-        sigma_map(problem, errors.scene) if isinstance(errors, GnssErrors) and mapped else None,
+        sigma_map(problem, errors.scene) if mapped and isinstance(errors, GnssErrors) else None,
     )
 
 

@@ -192,6 +192,7 @@ class KalmanFilter:
         self._monitor = InnovationMonitor(runs, uavs) if model.monitored else None
         self._doubted = np.zeros((runs, uavs), dtype=np.bool_)
         self._refused_miss = np.full((runs, uavs, 3), np.nan)
+        self._since_miss = np.zeros((runs, uavs), dtype=np.int64)
         self._calm_s = np.zeros((runs, uavs))
         self._follows = np.zeros((runs, uavs), dtype=np.bool_)
         self._barred = np.zeros((runs, uavs), dtype=np.bool_)
@@ -279,6 +280,7 @@ class KalmanFilter:
         first = not self._begun.any()
         has_fix = (available | first) & (new | first)
         if self._monitor is not None:
+            self._since_miss += 1
             self._bar_repeated(position, velocity)
             sigma, covariance = self._watched(position, sigma, covariance, has_fix, begins, active)
         self._epoch += 1
@@ -316,7 +318,7 @@ class KalmanFilter:
         usable = np.isfinite(position) & np.isfinite(velocity) & np.isfinite(sigma) & (sigma > 0.0)
         self._note_verdict(available, np.asarray(usable.all(-1)), active)
         if self._monitor is not None:
-            self._note_doubts(position, usable, sigma)
+            self._note_doubts(position, usable, sigma, available)
         self._advance_covariances(covariance, sigma, active)
 
     def _gives_in(self) -> Mask:
@@ -358,7 +360,8 @@ class KalmanFilter:
         squared = np.empty(sigma.shape)
         squared_innovations(
             self._mean, self._packed, position, sigma * np.sqrt(monitor.scale), measured,
-            model.error_memory, model.error_noise, RECEIVER_NOISE_M**2, self._refused_miss, squared,
+            model.error_memory, model.error_noise, RECEIVER_NOISE_M**2, self._refused_miss,
+            self._since_miss, squared,
         )  # fmt: skip
         stepped = (squared > model.gate**2).any(-1)
         calm = self._calm_s >= CALM_S - 1e-9
@@ -385,14 +388,20 @@ class KalmanFilter:
         epoch_s = self._model.period_s * self._model.ticks_per_epoch
         self._refused_s = np.where(self._used, 0.0, self._refused_s + epoch_s * waiting)
 
-    def _note_doubts(self, position: Array, usable: Mask, sigma: Array) -> None:
-        """Say whose fixes have been refused for long, and keep what refused ones were off."""
+    def _note_doubts(self, position: Array, usable: Mask, sigma: Array, available: Mask) -> None:
+        """Say whose fixes have been refused for long, and keep what the last was off if it was refused.
+
+        It is kept as long as no new fix comes: receivers may be slower than the epochs.
+        """
         assert self._monitor is not None
+        fresh = self._verdict != kalman.NO_FIX
         refused = (self._verdict == kalman.REFUSED)[..., None] & usable
-        self._refused_miss = np.where(refused, position - self._mean[..., 0], np.nan)
+        miss = np.where(refused, position - self._mean[..., 0], np.nan)
+        self._refused_miss = np.where(fresh[..., None], miss, self._refused_miss)
+        self._since_miss[fresh] = 0
         self._doubted = self._begun & (self._refused_s >= GATE_PATIENCE_S - 1e-9)
         spread = CALM_SIGMAS**2 * (self._packed[..., 0] + sigma**2)
-        near = (self._refused_miss**2 <= spread).all(-1)
+        near = (self._refused_miss**2 <= spread).all(-1) & available
         epoch_s = self._model.ticks_per_epoch * self._model.period_s
         self._calm_s = np.where(self._doubted & near, self._calm_s + epoch_s, 0.0)
         time_s = (self._epoch - 1) * epoch_s

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from napf_mpc.navigation.gnss import GnssScene
 from napf_mpc.navigation.gnss_levels import levels_of
 from napf_mpc.navigation.pseudorange_solution import Check, SolverSettings, solve
-from napf_mpc.navigation.range_errors import carrier_to_noise_dbhz
-from napf_mpc.navigation.sky import elevation_rad
 
 __all__ = ["GnssMap", "gnss_map"]
 
@@ -30,7 +28,7 @@ class GnssMap:
     north_m: Array
     """(y,) of the grid [m]."""
     in_sight: Array
-    """(y, x) satellites above the mask with nothing in the way."""
+    """(y, x) satellites above the masks of elevation and C/N0 with nothing in the way."""
     hdop: Array
     """(y, x) of those; infinite where they give no position."""
     vdop: Array
@@ -69,21 +67,17 @@ def gnss_map(
     seen, dop, covariance, level = [], [], [], []
     for first in range(0, len(places), _BLOCK):
         part = places[first : first + _BLOCK][None]
-        quiet = np.zeros((1, part.shape[1], len(scene.names)))
-        observed = one.observe(time_s, part, quiet)
-        # The nominal strength, so that the map shows the place and not one drawing of the fading.
-        strength = carrier_to_noise_dbhz(
-            elevation_rad(observed.directions), *scene.config.carrier_to_noise_dbhz
-        )
-        sigma = one.believed_sigma(observed.directions, np.broadcast_to(strength[:, None], quiet.shape))
-        free = observed.in_sight[0]
-        unit = np.broadcast_to(observed.directions, (part.shape[1], *observed.directions.shape[1:]))
-        found = solve(unit, scene.clock, quiet[0], np.where(free, sigma[0], 1.0), free, _PLAIN)
+        # The expected strength, so that the map shows the place and not one drawing of the fading.
+        expected = one.expect(time_s, part)
+        free = expected.in_sight[0] & expected.tracked[0]
+        unit = np.broadcast_to(expected.directions, (part.shape[1], *expected.directions.shape[1:]))
+        sigma = np.where(free, expected.sigma[0], 1.0)
+        found = solve(unit, scene.clock, expected.error[0], sigma, free, _PLAIN)
         none = found.check == Check.NONE
         seen.append(free.sum(-1).astype(np.float64))
         dop.append(found.dop)
         covariance.append(np.where(none[:, None, None], np.inf, found.covariance))
-        level.append(levels_of(one.expect(time_s, part), one).level_m)
+        level.append(levels_of(expected, one).level_m)
     inside = obstacles.signed_distance(places[None])[0] <= 0.0
     shape = grid.shape[:2]
     dops = np.where(inside[:, None], np.nan, np.concatenate(dop))

@@ -196,6 +196,7 @@ def squared_innovations(
     error_noise: Array,
     position_noise: float,
     refused_miss: Array,
+    since_miss: NDArray[np.int64],
     out: Array,
 ) -> None:
     """Write squared innovations of the position over their variances, before any gate.
@@ -213,9 +214,11 @@ def squared_innovations(
     position_noise : float
         Variance of the white noise in the position [m^2].
     refused_miss : array, shape (run, uav, 3)
-        What the fix of the epoch before was off the estimate if it was refused [m]; NaN if it was not. A fix
-        after a refused one is compared with that, moved on by the estimate, and not with the estimate: a
-        jump is one wild innovation, however long it lasts.
+        What the last fix was off the estimate if it was refused [m]; NaN if it was not. A fix after a refused
+        one is compared with that, moved on by the estimate, and not with the estimate: a jump is one wild
+        innovation, however long it lasts.
+    since_miss : array of int, shape (run, uav)
+        Epochs from that fix to this one.
     out : array, shape (run, uav, 3)
         Out; NaN where nothing is measured, or a number is not finite.
     """
@@ -232,7 +235,8 @@ def squared_innovations(
                 miss = fix_position[r, i, a] - x[0] - sigma * memory * x[2]
                 if np.isfinite(refused_miss[r, i, a]):
                     miss = fix_position[r, i, a] - x[0] - refused_miss[r, i, a]
-                    spread = 2.0 * ((1.0 - memory) * sigma * sigma + position_noise)
+                    left = memory ** since_miss[r, i]
+                    spread = 2.0 * ((1.0 - left) * sigma * sigma + position_noise)
                 # A sigma of zero means unknown: the fix is refused, and says nothing of sigmas.
                 if sigma > 0.0 and spread > 0.0 and np.isfinite(miss):
                     out[r, i, a] = miss * miss / spread

@@ -113,7 +113,7 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
             holding=~trusted | held,
             feedforward=np.zeros((*trusted.shape, 4)),
         )
-        return replace(self._hold(command, trusted), reason=waiting_reasons(guide))
+        return replace(self._hold(self._wait(command, nav), trusted), reason=waiting_reasons(guide))
 
 
 def waiting_reasons(guide: Guide) -> NDArray[np.int8]:

@@ -18,7 +18,7 @@ def north(metres: float) -> np.ndarray:
 
 
 class Flown:
-    """A UAV at 2 m/s whose fixes are true but for what is added; one step and fix every 0.1 s."""
+    """A UAV at 2 m/s whose fixes are true but for what is added; a step every 0.1 s, by default a fix too."""
 
     def __init__(
         self,
@@ -28,6 +28,7 @@ class Flown:
         monitor: str = "innovations",
         sigma_m: float = 1.0,
         limit_s: float | None = None,
+        fix_every_s: float = PERIOD_S,
     ) -> None:
         navigation = GaussMarkov.model_validate(
             {"filter": "kalman", "monitor": monitor, "dispute_limit_s": limit_s}
@@ -41,7 +42,10 @@ class Flown:
                 self.filter.predict(np.zeros((1, 1, 3)), one)
             place = (SPEED * t + position(t)).reshape(1, 1, 3)
             speed = (SPEED + (velocity(t) if velocity else 0.0)).reshape(1, 1, 3)
-            self.filter.correct(place, speed, sigma_m**2 * np.eye(3)[None, None], all_of, True, one)
+            new = n % round(fix_every_s / PERIOD_S) == 0
+            if new:
+                fix = place
+            self.filter.correct(fix, speed, sigma_m**2 * np.eye(3)[None, None], all_of, new, one)
             nav = self.filter.solution(t, np.zeros((1, 1, 3)), np.zeros((1, 1, 3)))
             self.time_s.append(t)
             self.error.append(float(np.linalg.norm(nav.position[0, 0] - SPEED * t)))
@@ -72,6 +76,16 @@ def test_a_jump_is_held_out_and_the_uav_holds_until_it_is_undone(sigma_m: float)
     assert flown.filter.refused_fixes[0, 0] == 200
     assert flown.filter.monitor is not None
     assert flown.filter.monitor.alarms[0, 0] == 1  # the dispute itself: sigmas are not what is wrong
+
+
+def test_a_receiver_slower_than_the_filter_is_held_out_as_well() -> None:
+    """A fix a second: the next is compared with the refused one before it, not with that of the epoch."""
+    flown = Flown(60.0, jump(10.0, 10.0, 40.0), sigma_m=2.5, fix_every_s=1.0)
+    assert max(flown.error) < 0.3  # none of the 10 m
+    (began, first), (ended, last) = flown.turns
+    assert (first, last) == ("begins", "ends")
+    assert (began, ended) == (pytest.approx(12.9, abs=0.1), pytest.approx(40.0, abs=0.1))
+    assert not any(flown.available[flown.at(began) : flown.at(ended)])
 
 
 def test_unwatched_the_same_jump_is_believed_after_three_seconds() -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from napf_mpc.apf import repulsion
 from napf_mpc.errors import ProblemError
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.guided_field import GuidedNapfPlanner
 from napf_mpc.planners.planner import Command
 from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner, PotentialFieldPlanner
 from napf_mpc.planners.registry import make_planner
@@ -401,11 +402,12 @@ def test_who_holds_stays_where_it_was_and_the_others_wait_for_it() -> None:
     assert again.velocity[0, 3, 0] == pytest.approx(3.0)
 
 
-def test_a_formation_waits_for_a_uav_in_dispute_but_others_do_not() -> None:
+@pytest.mark.parametrize("make", [NapfPlanner, GuidedNapfPlanner])
+def test_a_formation_waits_for_a_uav_in_dispute_but_others_do_not(make: type[PotentialFieldPlanner]) -> None:
     nav = solution(np.stack([SLOTS, SLOTS]))
     disputed = np.zeros((2, 4), dtype=bool)
     disputed[0, 2] = True
-    planner = NapfPlanner(problem())
+    planner = make(problem())
     planner.reset(ObstacleSet.empty(), 2)
     command = planner.step(replace(nav, available=~disputed, disputed=disputed), 0.0)
     assert command.holding.tolist() == [[True] * 4, [False] * 4]
