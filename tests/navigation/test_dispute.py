@@ -29,9 +29,11 @@ class Flown:
         sigma_m: float = 1.0,
         limit_s: float | None = None,
         fix_every_s: float = PERIOD_S,
+        outage_s: tuple[float, float] = (0.0, 0.0),
+        **keys: float,
     ) -> None:
         navigation = GaussMarkov.model_validate(
-            {"filter": "kalman", "monitor": monitor, "dispute_limit_s": limit_s}
+            {"filter": "kalman", "monitor": monitor, "dispute_limit_s": limit_s} | keys
         )
         self.filter = KalmanFilter(FilterModel.of_navigation(navigation, PERIOD_S, 1), 1, 1)
         one, all_of = np.ones(1, dtype=bool), np.ones((1, 1), dtype=bool)
@@ -45,7 +47,8 @@ class Flown:
             new = n % round(fix_every_s / PERIOD_S) == 0
             if new:
                 fix = place
-            self.filter.correct(fix, speed, sigma_m**2 * np.eye(3)[None, None], all_of, new, one)
+            there = not outage_s[0] <= t < outage_s[1]
+            self.filter.correct(fix, speed, sigma_m**2 * np.eye(3)[None, None], all_of & there, new, one)
             nav = self.filter.solution(t, np.zeros((1, 1, 3)), np.zeros((1, 1, 3)))
             self.time_s.append(t)
             self.error.append(float(np.linalg.norm(nav.position[0, 0] - SPEED * t)))
@@ -86,6 +89,25 @@ def test_a_receiver_slower_than_the_filter_is_held_out_as_well() -> None:
     assert (first, last) == ("begins", "ends")
     assert (began, ended) == (pytest.approx(12.9, abs=0.1), pytest.approx(40.0, abs=0.1))
     assert not any(flown.available[flown.at(began) : flown.at(ended)])
+
+
+def test_steps_of_a_slow_receiver_may_be_as_large_as_its_errors_make_them() -> None:
+    """In a second an error of 2.5 m with a correlation time of 2 s moves by metres: still the same jump."""
+
+    def wrong(t: float) -> np.ndarray:
+        swing = 0.0 if t < 10.5 else 2.2 if round(t) % 2 else -2.2
+        return north(11.5 + swing if t >= 10.0 else 0.0)
+
+    flown = Flown(40.0, wrong, sigma_m=2.5, fix_every_s=1.0, correlation_time_s=2.0)
+    assert [turn for _, turn in flown.turns] == ["begins"]
+    assert max(flown.error) < 0.3
+
+
+def test_without_a_witness_a_fix_is_not_used_for_being_no_farther_than_the_estimate_is_unsure() -> None:
+    """12 m are two sigmas of 6 m: a dispute is not ended by forgetting."""
+    flown = Flown(90.0, jump(12.0), gnss_velocity_sigma_mps=9.0)
+    assert [turn for _, turn in flown.turns][:2] == ["begins", "given in"]
+    assert flown.sigma[flown.at(flown.turns[1][0]) - 1] > 9.5
 
 
 def test_unwatched_the_same_jump_is_believed_after_three_seconds() -> None:
@@ -131,6 +153,20 @@ def test_fixes_that_stay_near_for_long_are_used_again() -> None:
     assert ended - began == pytest.approx(CALM_S, abs=0.3)
     assert flown.available[-1]
     assert flown.error[-1] < 2.5
+
+
+def test_errors_that_hardly_change_are_forgotten_in_a_dispute() -> None:
+    """Of an error that lasts for 1000 s much is known, and no other would ever fit; in doubt that is void."""
+    flown = Flown(60.0, jump(2.5), correlation_time_s=1000.0)
+    assert [turn for _, turn in flown.turns] == ["begins", "ends"]
+    assert flown.turns[1][0] - flown.turns[0][0] == pytest.approx(CALM_S, abs=0.3)
+
+
+def test_an_outage_calms_nothing() -> None:
+    """Nearness counts from when fixes are back."""
+    flown = Flown(70.0, jump(2.5), outage_s=(20.0, 28.0))
+    assert [turn for _, turn in flown.turns] == ["begins", "ends"]
+    assert flown.turns[1][0] == pytest.approx(28.0 + CALM_S, abs=0.3)
 
 
 def test_a_position_that_stands_still_while_its_velocity_does_not_is_refused_at_once() -> None:

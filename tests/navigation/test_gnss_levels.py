@@ -8,10 +8,10 @@ from napf_mpc.errors import ProblemError
 from napf_mpc.navigation.gnss import GnssScene, gnss_scene
 from napf_mpc.navigation.gnss_fixes import GnssErrors, GnssFixes
 from napf_mpc.navigation.gnss_levels import TRUSTED, levels_of
-from napf_mpc.navigation.range_errors import p_reflected
+from napf_mpc.navigation.range_errors import carrier_to_noise_dbhz, p_reflected
 from napf_mpc.problem import EmptyWorld, Gnss
 from napf_mpc.problem_file import load_problem
-from napf_mpc.streams import Stream, normals
+from napf_mpc.streams import NormalRows, Stream, normals
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box
 
@@ -122,3 +122,50 @@ def test_levels_that_nobody_computes_are_not_flown_by() -> None:
         load_problem(STREET, ['planner.safety="protection_level"', 'navigation.filter="none"'])
     with pytest.raises(ProblemError, match="bounds the error of fixes"):
         load_problem(STREET, ['navigation.integrity="araim"', 'planner.safety="protection_level"'])
+
+
+def test_before_its_strength_is_known_a_low_signal_is_likelier_a_reflection() -> None:
+    """With C/N0 as its elevation lets expect, the prior counts: 0.7 on the horizon to 0 in the zenith."""
+    receivers = scene(config(), range(1))
+    elevation = np.deg2rad([[15.0, 45.0, 80.0]])
+    unit = np.stack([np.cos(elevation), np.zeros((1, 3)), np.sin(elevation)], axis=-1)
+    low, high = receivers.config.carrier_to_noise_dbhz
+    usual = carrier_to_noise_dbhz(elevation, low, high)[:, None]
+    prior = 0.7 * (1.0 - np.array([15.0, 45.0, 80.0]) / 90.0)
+    expected = p_reflected(np.zeros(3), 2.0, 12.0, 4.0, prior)
+    np.testing.assert_allclose(receivers.p_reflected(unit, usual)[0, 0], expected, rtol=1e-9)
+
+
+def test_a_fix_with_a_level_is_the_plain_one_of_the_satellites_that_are_trusted() -> None:
+    """The level bounds weighted least squares of what it used, not the robust solution of all."""
+    cfg, place = config(integrity="araim"), line(8, 1, 20.0, z=30.0)
+    fixes = flight(cfg, range(8), 1, WALLS)
+    fix = fixes.fix(0, place)
+    receivers = scene(cfg, range(8), WALLS)
+    noise = NormalRows(3, range(8), Stream.GNSS_NOISE, 1, len(receivers.names)).take()
+    seen = receivers.observe(0.0, place, noise)
+    levels = levels_of(seen, receivers)
+    there = np.isfinite(levels.level_m).all(-1)
+    assert there.sum() > 3
+    sigma = receivers.sight_sigma(seen.directions, seen.carrier_to_noise)[:, 0]
+    for run in np.flatnonzero(there):
+        used = levels.used[run]
+        h = np.zeros((used.sum(), 5))
+        h[:, :3] = -seen.directions[run, used]
+        h[np.arange(len(h)), 3 + receivers.clock[used]] = 1.0
+        scale = sigma[run, used]
+        offset = np.linalg.lstsq(h / scale[:, None], seen.error[run, 0, used] / scale)[0][:3]
+        np.testing.assert_allclose(fix.error[run, 0], offset, atol=1e-6)
+
+
+def test_a_receiver_that_reports_half_its_sigma_reports_half_its_level() -> None:
+    place = line(6, 1, 20.0, z=80.0)
+    whole, half = (
+        flight(config(integrity="araim", reported_sigma_scale=scale), range(6), 1, ObstacleSet.empty())
+        .fix(0, place)
+        .protection
+        for scale in (1.0, 0.5)
+    )
+    assert whole is not None
+    assert half is not None
+    np.testing.assert_allclose(half, 0.5 * whole)

@@ -133,6 +133,20 @@ def test_a_fifth_of_the_sigma_is_flagged_in_time_and_in_the_results() -> None:
     assert set(events["action"][0].split(" x ")[0].split()) <= {"sigma", "east", "north", "up"}
 
 
+def test_disputes_are_told_among_the_events() -> None:
+    """Between houses positions jump: who holds when, and until when, stands in the results."""
+    street = load_problem("street_canyon_gnss", [WATCHED, "simulation.time_limit_s=60"])
+    events = fly_block(street, ["napf"], 301, range(4)).events
+    disputes = ["fixes" in str(cause) for cause in events["cause"]]
+    turns = list(zip(events["run"], events["uav"], events["t_s"], events["action"], strict=True))
+    begun = [turn for turn, is_one in zip(turns, disputes, strict=True) if is_one and turn[3] == "hold"]
+    ended = [turn for turn, is_one in zip(turns, disputes, strict=True) if is_one and turn[3] == "fly on"]
+    assert begun
+    assert ended
+    for run, uav, time_s, _ in ended:
+        assert any(one[:2] == (run, uav) and one[2] < time_s for one in begun)
+
+
 def test_alarms_do_not_depend_on_the_block() -> None:
     problem = study(WATCHED, "navigation.reported_sigma_scale=0.3", "simulation.time_limit_s=10")
     together = fly_block(problem, ["napf"], 41, range(3))

@@ -87,6 +87,31 @@ def test_a_run_has_its_map_whatever_else_is_in_the_block() -> None:
     np.testing.assert_array_equal(both.variance(places)[0][2:], alone.variance(places[2:])[0])
 
 
+def test_a_place_is_that_of_the_moment_at_which_the_formation_is_due() -> None:
+    """140 m at 0.05 m/s take 47 min: satellites have gone on by a tenth of a turn, and sigma with them."""
+    slow = load_problem(
+        "street_canyon_gnss",
+        {
+            "planner.covariance": "mapped", "mission.speed_mps": 0.05, "simulation.time_limit_s": 3000.0,
+            "world": {"kind": "empty"},
+        },
+    )  # fmt: skip
+    assert isinstance(slow.mission, FormationMission)
+    _, errors, made = drawn(slow, range(1))
+    along = made.low_m[0] + made.cell_m[0] * np.arange(made.nodes.shape[1])
+    n = int(np.argmin(np.abs(along - 140.0)))
+    at = made.low_m + made.cell_m * np.array([n, 5, 1])
+    place = made.frame.to_world(at[None])
+    now, due = (
+        expected_variance(errors.scene.of_run(0, ObstacleSet.empty()), place, time_s)[0]
+        for time_s in (0.0, along[n] / 0.05)
+    )
+    np.testing.assert_allclose(
+        made.nodes[0, n, 5, 1], due, rtol=0.01
+    )  # neighbours are due 50 s sooner and later
+    assert np.abs(np.sqrt(now / due) - 1.0).max() > 0.03
+
+
 def made_by_hand(nodes: Array) -> SigmaMap:
     """A map of one run on a grid of 10 m from the origin, the path to the east."""
     frame = PathFrame.from_angles((0.0, 0.0, 0.0), 0.0, 0.0)

@@ -607,3 +607,12 @@ def test_program_of_a_horizon_can_be_held_and_given_to_another_solver() -> None:
     other = make_solver("osqp")
     other.setup(program)
     np.testing.assert_allclose(other.solve().z, result.z[0, 1], atol=1e-6)
+
+
+def test_a_program_that_was_not_solved_starts_cold_whatever_point_it_left() -> None:
+    answer = make_batch_solver("kernel").solve_batch(flight(1, 2, 4))
+    status = answer.status.copy()
+    status[0, 1] = STATUSES.index(QpStatus.MAX_ITERATIONS)
+    warm = replace(answer, status=status).warm_start(answer.states, answer.inputs)
+    assert np.isnan(warm.z[0, 1]).all()
+    assert np.isfinite(warm.z[0, 0]).all()

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.stats import norm
 
 from napf_mpc.navigation.integrity.araim import IntegrityRequirement, RangeErrors, protection_level
 from napf_mpc.navigation.integrity.levels import Levels, LevelSettings, NoLevel, protection_levels
@@ -57,6 +59,63 @@ def test_levels_of_all_in_view_are_those_of_the_reference(p_fault: float) -> Non
     tolerance = 0.02 if p_fault == 0.0 else 0.08 * reference.vertical_m
     assert mine.level_m[0] == pytest.approx([reference.horizontal_m, reference.vertical_m], abs=tolerance)
     assert mine.hypotheses[0] <= max(1, len(reference.prior))
+
+
+def equation(
+    used: np.ndarray, p_fault: np.ndarray, share: float, settings: LevelSettings
+) -> tuple[float, float]:
+    """HPL and VPL by solving anew without each single satellite: two sides of the whole solution's error, one
+    of each hypothesis'."""
+    geometry = np.zeros((14, 5))
+    geometry[:, :3] = -SIGHT
+    geometry[np.arange(14), 3 + CLOCK] = 1.0
+
+    def variances(kept: np.ndarray) -> np.ndarray:
+        h = geometry[kept] / SIGMA[kept, None]
+        return np.diag(np.linalg.inv(h.T @ h))[:3]
+
+    prior = p_fault / (1.0 - p_fault) * np.prod(1.0 - p_fault)
+    left = 1.0 - np.prod(1.0 - p_fault) - prior.sum()
+    whole, axes = variances(used), []
+    for q, (part, alarms) in enumerate([(0.25, 4.0), (0.25, 4.0), (0.5, 2.0)]):
+        budget = part * share * (settings.p_hmi - left)
+        factor = norm.isf(settings.p_false_alarm / 2.0 / alarms / 14)
+
+        def beyond(level: float, q: int = q, factor: float = factor) -> float:
+            total = 2.0 * norm.sf(level / np.sqrt(whole[q]))
+            for s in range(14):
+                without = variances(used & (np.arange(14) != s))[q]
+                room = level - factor * np.sqrt(max(without - whole[q], 0.0))
+                total += prior[s] * norm.sf(room / np.sqrt(without))
+            return float(total)
+
+        axes.append(brentq(lambda level, b=budget, f=beyond: f(level) - b, 0.1, 500.0))
+    return float(np.hypot(axes[0], axes[1])), float(axes[2])
+
+
+@pytest.mark.parametrize("bad", [None, 0, 3, 9, 13])
+def test_a_level_solves_its_equation(bad: int | None) -> None:
+    """To a centimetre: half of P_HMI for all in view, a quarter over 14 for each set without a satellite."""
+    p_fault, settings = np.linspace(5e-4, 9e-4, 14), LevelSettings(2e-3, 2e-2)
+    used = np.ones(14, dtype=bool)
+    ranges = np.zeros((1, 14))
+    if bad is not None:
+        used[bad], ranges[0, bad] = False, 100.0
+    found = levels(ranges, p_fault, settings=settings)
+    assert found.hypotheses[0] == 14  # all single faults, and no others
+    np.testing.assert_array_equal(found.used[0], used)
+    expected = equation(used, p_fault, 0.5 if bad is None else 0.25 / 14, settings)
+    assert found.level_m[0].tolist() == pytest.approx(expected, abs=0.02)
+
+
+def test_a_fault_that_nothing_can_look_at_is_paid_for() -> None:
+    """Alone of its constellation a satellite is never contradicted: its chance is spent, or is too much."""
+    clock = np.array([0] * 13 + [1])
+    rare, twice, often = (np.append(np.full(13, 1e-5), p) for p in (4e-4, 8e-4, 3e-3))
+    first, second, third = (levels(np.zeros((1, 14)), p, clock=clock) for p in (rare, twice, often))
+    assert third.why[0] == NoLevel.UNMONITORED
+    # Of 2e-3 are left 1.6e-3 and 1.2e-3, and a tail of so much less is farther out.
+    assert (second.level_m[0] > first.level_m[0] + 0.03).all()
 
 
 def test_rank_one_changes_are_solutions_without_a_satellite() -> None:
