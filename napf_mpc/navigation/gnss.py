@@ -132,10 +132,7 @@ class GnssScene:
             Leave the buildings and the C/N0 mask out.
         """
         cfg = self.config
-        unit = self.directions(time_s)
-        elevation = elevation_rad(unit)
-        above = elevation >= math.radians(cfg.elevation_mask_deg)
-        elevation = np.where(above, elevation, 0.5 * math.pi)
+        unit, elevation, above = self._overhead(time_s)
         if open_sky:
             in_sight = np.broadcast_to(above[:, None], noise.shape).copy()
         else:
@@ -176,10 +173,7 @@ class GnssScene:
             Any places [m].
         """
         cfg = self.config
-        unit = self.directions(time_s)
-        elevation = elevation_rad(unit)
-        above = elevation >= math.radians(cfg.elevation_mask_deg)
-        elevation = np.where(above, elevation, 0.5 * math.pi)
+        unit, elevation, above = self._overhead(time_s)
         in_sight = line_of_sight(self.obstacles, position, unit, above)
         usual = carrier_to_noise_dbhz(elevation, *cfg.carrier_to_noise_dbhz)[:, None]
         expected = np.where(in_sight, usual, usual - cfg.reflected_loss_db)
@@ -220,6 +214,16 @@ class GnssScene:
             carrier_to_noise - expected, cfg.fading_db, cfg.reflected_loss_db, cfg.reflected_loss_sigma_db,
             cfg.prior_reflected * np.maximum(1.0 - elevation / (0.5 * math.pi), 0.0)[:, None],
         )  # fmt: skip
+
+    def _overhead(self, time_s: float) -> tuple[Array, Array, Mask]:
+        """Directions (run, sat, 3), elevations (run, sat) [rad], and who is above the mask.
+
+        Those below count as in the zenith, where every law is defined.
+        """
+        unit = self.directions(time_s)
+        elevation = elevation_rad(unit)
+        above = elevation >= math.radians(self.config.elevation_mask_deg)
+        return unit, np.where(above, elevation, 0.5 * math.pi), above
 
     def _elevation(self, unit: Array) -> Array:
         """Elevation (run, sat) of satellites, of those under the mask its own [rad]."""

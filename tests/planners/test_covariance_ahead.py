@@ -1,5 +1,6 @@
 """What the filter expects of its covariance, in the hands of the planners: margins, room, shared errors."""
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -75,6 +76,30 @@ def test_the_margin_of_a_stage_is_that_of_the_covariance_then(asked: str) -> Non
         assert 0.2 < np.median(grown[..., -1, :]) < 0.5
 
 
+def overheard(
+    flown: Problem, kind: str
+) -> tuple[QpPlanner | GuidedNapfPlanner, list[Array], list[NavSolution]]:
+    """A planner, and lists of what its guidance leaves room for and of what it is told, at each step."""
+    planner = QpPlanner(flown) if kind == "qp" else GuidedNapfPlanner(flown)
+    guidance = planner._guidance if isinstance(planner, QpPlanner) else planner.guidance
+    assert guidance is not None
+    room: list[Array] = []
+    given: list[NavSolution] = []
+    step, fly = guidance.step, planner.step
+
+    def guided(position: Array, covariance: Array, *others: object, **named: object) -> Guide:
+        room.append(covariance.copy())
+        return step(position, covariance, *others, **named)  # type: ignore[arg-type]
+
+    def flying(solution: NavSolution, time_s: float) -> Command:
+        given.append(copy.deepcopy(solution))
+        return fly(solution, time_s)
+
+    guidance.step = guided  # type: ignore[method-assign, assignment]
+    planner.step = flying  # type: ignore[method-assign]
+    return planner, room, given
+
+
 @ASKED
 @pytest.mark.parametrize("kind", ["qp", "napf_guided"])
 def test_guidance_leaves_room_for_the_sigma_that_is_expected_at_the_end_of_the_horizon(
@@ -82,25 +107,10 @@ def test_guidance_leaves_room_for_the_sigma_that_is_expected_at_the_end_of_the_h
 ) -> None:
     """The filter's first half second: of its variance three quarters are to be left 6.5 s later."""
     flown = problem(0.5, kind, asked)
-    planner = QpPlanner(flown) if kind == "qp" else GuidedNapfPlanner(flown)
-    guidance = planner._guidance if isinstance(planner, QpPlanner) else planner.guidance
-    assert guidance is not None
-    room: list[Array] = []
-    now: list[Array] = []
-    step, fly = guidance.step, planner.step
-
-    def guided(position: Array, covariance: Array, *others: object, **named: object) -> Guide:
-        room.append(covariance)
-        return step(position, covariance, *others, **named)  # type: ignore[arg-type]
-
-    def flying(solution: NavSolution, time_s: float) -> Command:
-        now.append(solution.position_covariance.copy())
-        return fly(solution, time_s)
-
-    guidance.step = guided  # type: ignore[method-assign, assignment]
-    planner.step = flying  # type: ignore[method-assign]
+    planner, room, given = overheard(flown, kind)
     simulate(flown, planner, seed=101, runs=2)
-    share = np.einsum("truaa->tru", np.array(room)) / np.einsum("truaa->tru", np.array(now))
+    now = [np.einsum("...aa->...", nav.position_covariance) for nav in given]
+    share = np.einsum("truaa->tru", np.array(room)) / now
     if asked == "expected":
         np.testing.assert_allclose(share, 0.76, atol=0.02)
     else:
@@ -116,23 +126,7 @@ def test_with_a_sigma_map_guidance_leaves_room_for_the_place_at_the_end_of_the_p
         "street_canyon_gnss",
         {"planner.covariance": "mapped", "planner.kind": kind, "simulation.time_limit_s": 4.0},
     )
-    planner = QpPlanner(flown) if kind == "qp" else GuidedNapfPlanner(flown)
-    guidance = planner._guidance if isinstance(planner, QpPlanner) else planner.guidance
-    assert guidance is not None
-    room: list[Array] = []
-    given: list[NavSolution] = []
-    step, fly = guidance.step, planner.step
-
-    def guided(position: Array, covariance: Array, *others: object, **named: object) -> Guide:
-        room.append(covariance)
-        return step(position, covariance, *others, **named)  # type: ignore[arg-type]
-
-    def flying(solution: NavSolution, time_s: float) -> Command:
-        given.append(solution)
-        return fly(solution, time_s)
-
-    guidance.step = guided  # type: ignore[method-assign, assignment]
-    planner.step = flying  # type: ignore[method-assign]
+    planner, room, given = overheard(flown, kind)
     simulate(flown, planner, seed=3, runs=2)
     # The first step has no plan yet: straight ahead at 2 m/s for 6.5 s, fixes with the sigmas on the way.
     nav, times = given[0], np.cumsum(stage_grid(0.1, 20, 6.5))
