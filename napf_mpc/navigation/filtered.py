@@ -20,6 +20,7 @@ from napf_mpc.navigation.fix import PlacedErrors, PositionErrors, fixes_of_fligh
 from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.integrity.overbound import Overbound
 from napf_mpc.navigation.monitor import InnovationMonitor
+from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.replay import RecordedErrors
 from napf_mpc.navigation.sensors import Sensors
 from napf_mpc.navigation.solution import NavSolution
@@ -33,7 +34,7 @@ Mask = NDArray[np.bool_]
 
 
 class FilteredNavigation:
-    """Navigation of a block of runs with ``navigation.filter = "kalman"``.
+    """Navigation of a block of runs with a filter: ``navigation.filter = "kalman"`` or ``"point_mass"``.
 
     Parameters
     ----------
@@ -72,9 +73,13 @@ class FilteredNavigation:
         self._ticks_per_fix = ticks_per_fix
         self._overbound: Overbound | None = None
         self._sensors = Sensors(navigation, seed, runs, uavs, period_s, velocity)
-        self._filter = KalmanFilter(
-            FilterModel.of_navigation(navigation, period_s, ticks_per_fix), len(runs), uavs
-        )
+        model = FilterModel.of_navigation(navigation, period_s, ticks_per_fix)
+        self._filter: KalmanFilter | PointMassFilter
+        if navigation.filter == "point_mass":
+            degrees = navigation.student_degrees_of_freedom
+            self._filter = PointMassFilter(model, degrees, len(runs), uavs)
+        else:
+            self._filter = KalmanFilter(model, len(runs), uavs)
 
     @property
     def gated_fixes(self) -> NDArray[np.int64]:
@@ -89,7 +94,7 @@ class FilteredNavigation:
     @property
     def monitor(self) -> InnovationMonitor | None:
         """What watches the innovations; None if nothing does."""
-        return self._filter.monitor
+        return self._filter.monitor if isinstance(self._filter, KalmanFilter) else None
 
     def solution(
         self,

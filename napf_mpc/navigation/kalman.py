@@ -179,12 +179,12 @@ def correct(
                 x, c = mean[r, i, a], packed[r, i, a]
                 memory = 0.0 if doubted[r, i] else error_memory[a]
                 noise = 1.0 if doubted[r, i] else error_noise[a]
-                _forget(x, c, memory, noise)
+                forget(x, c, memory, noise)
                 if keep:
                     _forget_carried(carried[r, i, a], response[r, i, a], memory, noise)
                 if fresh:
                     place, speed, sigma = fix_position[r, i, a], fix_velocity[r, i, a], fix_sigma[r, i, a]
-                    measured = _is_measured(place, sigma) and np.isfinite(speed)
+                    measured = is_measured(place, sigma) and np.isfinite(speed)
                     usable &= measured
                     witness &= measured
                     if not begins:
@@ -202,27 +202,27 @@ def correct(
                 x, c = mean[r, i, a], packed[r, i, a]
                 place, speed, sigma = fix_position[r, i, a], fix_velocity[r, i, a], fix_sigma[r, i, a]
                 if verdict[r, i] == BEGUN:
-                    _begin(x, c, place, speed, sigma, position_noise, velocity_noise, bias_variance)
+                    begin(x, c, place, speed, sigma, position_noise, velocity_noise, bias_variance)
                     if keep:
                         carried[r, i, a] = 0.0
                         response[r, i, a] = 0.0
                         response[r, i, a, 0], response[r, i, a, 2] = -sigma, 1.0
                     continue
-                alone = not fresh and fixless_axis[a] and _is_measured(place, sigma)
+                alone = not fresh and fixless_axis[a] and is_measured(place, sigma)
                 alone = alone and _position_inside(x, c, place, sigma, position_noise, gate)
                 spoken = witness and verdict[r, i] == REFUSED
                 if not (alone or spoken or verdict[r, i] == USED):
                     continue
-                _unpack(c, full)
+                unpack(c, full)
                 if not spoken:
-                    _take_in(x, full, k, place, 1.0, 0.0, sigma, position_noise)
+                    take_in(x, full, k, place, 1.0, 0.0, sigma, position_noise)
                     if keep:
                         _take_in_carried(carried[r, i, a], response[r, i, a], k, 1.0, 0.0, sigma)
                 if not alone:
-                    _take_in(x, full, k, speed, 0.0, 1.0, 0.0, velocity_noise)
+                    take_in(x, full, k, speed, 0.0, 1.0, 0.0, velocity_noise)
                     if keep:
                         _take_in_carried(carried[r, i, a], response[r, i, a], k, 0.0, 1.0, 0.0)
-                _pack(full, c)
+                pack(full, c)
 
 
 @compiled
@@ -256,7 +256,7 @@ def rescale(mean: Array, packed: Array, change: Array) -> None:
 
 
 @compiled_bare
-def _forget(x: Array, c: Array, memory: float, noise: float) -> None:
+def forget(x: Array, c: Array, memory: float, noise: float) -> None:
     """Carry the error g from one epoch of fixes to the next."""
     x[2] *= memory
     c[2] *= memory
@@ -274,7 +274,8 @@ def _forget_carried(carried: Array, response: Array, memory: float, noise: float
 
 
 @compiled_bare
-def _is_measured(position: float, sigma: float) -> bool:
+def is_measured(position: float, sigma: float) -> bool:
+    """Whether a measured position and its sigma are numbers that say something."""
     return bool(np.isfinite(position) and 0.0 < sigma < np.inf)
 
 
@@ -291,7 +292,7 @@ def _inside(miss: float, spread: float, gate: float) -> bool:
 
 
 @compiled_bare
-def _begin(
+def begin(
     x: Array,
     c: Array,
     position: float,
@@ -301,7 +302,7 @@ def _begin(
     velocity_noise: float,
     bias_variance: float,
 ) -> None:
-    """Begin with a fix: p = fix - sigma g, so the error of the position is that of the fix, turned round."""
+    """Begin an axis: p = fix - sigma g, so the error of the position is that of the fix, turned round."""
     x[0], x[1], x[2], x[3] = position, velocity, 0.0, 0.0
     c[:] = 0.0
     c[0] = sigma * sigma + position_noise
@@ -312,7 +313,8 @@ def _begin(
 
 
 @compiled_bare
-def _unpack(c: Array, full: Array) -> None:
+def unpack(c: Array, full: Array) -> None:
+    """Write a packed covariance (10) as a matrix (4, 4)."""
     n = 0
     for row in range(4):
         for column in range(row, 4):
@@ -322,7 +324,8 @@ def _unpack(c: Array, full: Array) -> None:
 
 
 @compiled_bare
-def _pack(full: Array, c: Array) -> None:
+def pack(full: Array, c: Array) -> None:
+    """Write the symmetric part of a matrix (4, 4) as a packed covariance (10)."""
     n = 0
     for row in range(4):
         for column in range(row, 4):
@@ -331,7 +334,7 @@ def _pack(full: Array, c: Array) -> None:
 
 
 @compiled_bare
-def _take_in(
+def take_in(
     x: Array, full: Array, k: Array, value: float, h_p: float, h_v: float, h_g: float, noise: float
 ) -> None:
     """Update with one scalar measurement of ``h_p p + h_v v + h_g g``; leaves the gain in ``k``."""

@@ -1,0 +1,172 @@
+"""The robust navigation filter: fixes with heavy tails about a dead-reckoned way.
+
+A Kalman filter must believe a reflected signal or refuse it, and then either stays wrong when fixes return to
+the truth, or starts anew from one that is wrong (:mod:`napf_mpc.navigation.filter`). This one keeps the whole
+density of the position on each axis (:mod:`napf_mpc.navigation.point_mass`): a fix far off is a second
+possibility that raises the variance, and fades or takes over with what comes after. No position is refused.
+
+It is given the same measurements and takes the same as known, but for the error of a fix: that has a Student
+law with ``student_degrees_of_freedom`` and the reported sigma as its scale, and is worth what its
+correlation time leaves of it. What a known change of sigma would tell of a Gauss-Markov error is not used.
+
+Axes are filtered apart, and what UAVs have in common is not told: their relative covariance is the sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.navigation import kalman, point_mass
+from napf_mpc.navigation.filter import GATE_PATIENCE_S, RECEIVER_NOISE_M, FilterModel
+from napf_mpc.navigation.fix import is_symmetric
+from napf_mpc.navigation.forecast import CovarianceForecast
+from napf_mpc.navigation.solution import NavSolution
+
+__all__ = ["PointMassFilter"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+UNINFORMATIVE = 1e12
+"""Factor on a fix's variance from which on a forecast takes it as saying nothing."""
+
+
+class PointMassFilter:
+    """The point-mass filters of all UAVs of a block of runs.
+
+    Each begins with the first fix that it is given, at t = 0 also with one that is carried on from before:
+    density = the Student law about the fix; velocity = GNSS velocity; bias zero, with its sigma. After
+    :data:`~napf_mpc.navigation.filter.GATE_PATIENCE_S` of fixes whose velocity the gate refused it does so
+    again.
+
+    Parameters
+    ----------
+    model : FilterModel
+        What is taken as known.
+    degrees : float
+        Degrees of freedom of the Student law of the fixes' errors, at least 1.
+    runs, uavs : int
+        How many.
+    """
+
+    def __init__(self, model: FilterModel, degrees: float, runs: int, uavs: int) -> None:
+        self._model, self._degrees = model, degrees
+        shape = (runs, uavs, 3)
+        self._mean = np.full((*shape, kalman.STATES), np.nan)
+        self._packed = np.full((*shape, kalman.PACKED), np.nan)
+        self._density = np.full((*shape, point_mass.NODES), 1.0 / point_mass.NODES)
+        self._grids = np.ones((*shape, 2))
+        self._astray = np.zeros(shape)
+        self._since = np.zeros(shape, dtype=np.int64)
+        self._verdict = np.zeros((runs, uavs), dtype=np.int8)
+        self._begun, self._used = (np.zeros((runs, uavs), dtype=np.bool_) for _ in range(2))
+        self._refused_s = np.zeros((runs, uavs))
+        self._refused_fixes, self._missed_fixes = (np.zeros((runs, uavs), dtype=np.int64) for _ in range(2))
+        self._sigma = np.full(shape, np.nan)
+        self._age, self._epochs_since_new, self._epochs_per_new = 0, 1, 1
+        self._forecast = model.forecast()
+
+    @property
+    def refused_fixes(self) -> NDArray[np.int64]:
+        """(run, uav) number of fixes refused so far, by the gate of the velocity or as unusable."""
+        return self._refused_fixes.copy()
+
+    @property
+    def missed_fixes(self) -> NDArray[np.int64]:
+        """(run, uav) number of epochs so far at which a fix was due and none came."""
+        return self._missed_fixes.copy()
+
+    def predict(self, velocity_change: Array, active: Mask) -> None:
+        """Carry the estimates over a tick; parameters are those of the Kalman filter's."""
+        model = self._model
+        kalman.predict(
+            self._mean, self._packed, velocity_change, model.period_s, model.bias_memory,
+            model.velocity_change_noise, model.bias_noise, active,
+        )  # fmt: skip
+        self._age += 1
+
+    def correct(
+        self, position: Array, velocity: Array, covariance: Array, available: Mask, new: bool, active: Mask
+    ) -> None:
+        """Take in one epoch of fixes; parameters are those of the Kalman filter's."""
+        model = self._model
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(np.einsum("...ii->...i", covariance))
+        sigma = np.where(is_symmetric(covariance)[..., None], sigma, np.nan)
+        first = not self._begun.any()
+        has_fix = (available | first) & (new | first)
+        self._missed_fixes += new & ~available & active[:, None]
+        begins = ~self._begun | (self._refused_s >= GATE_PATIENCE_S - 1e-9)
+        point_mass.correct(
+            self._mean, self._packed, self._density, self._grids, self._astray, self._since,
+            position, velocity, sigma, has_fix, model.fixless_axis, model.error_memory, model.error_noise,
+            self._degrees, RECEIVER_NOISE_M**2, model.velocity_sigma_mps**2, model.bias_sigma_mps2**2,
+            model.gate, begins, active, self._verdict,
+        )  # fmt: skip
+        self._age, self._sigma = 0, sigma
+        self._epochs_since_new += 1
+        if new:
+            self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
+        usable = np.isfinite(position) & np.isfinite(velocity) & np.isfinite(sigma) & (sigma > 0.0)
+        self._note_verdict(available, np.asarray(usable.all(-1)), active[:, None])
+
+    def _note_verdict(self, available: Mask, usable: Mask, flying: Mask) -> None:
+        verdict = self._verdict
+        begun, refused = (verdict == kalman.BEGUN) & flying, (verdict == kalman.REFUSED) & flying
+        used = ((verdict == kalman.USED) & flying) | begun
+        self._begun |= begun
+        self._refused_fixes += refused
+        self._used = (self._used | used) & ~refused & available
+        waiting = available & usable & ~self._used & flying
+        epoch_s = self._model.period_s * self._model.ticks_per_epoch
+        self._refused_s = np.where(self._used, 0.0, self._refused_s + epoch_s * waiting)
+
+    def solution(self, time_s: float, attitude: Array, body_rates: Array) -> NavSolution:
+        """Issue the solution of now; parameters and availability are those of the Kalman filter's."""
+        runs, uavs = self._begun.shape
+        position, velocity = np.empty((runs, uavs, 3)), np.empty((runs, uavs, 3))
+        covariance, widest = np.zeros((runs, uavs, 6, 6)), np.empty((runs, uavs))
+        kalman.report(self._mean, self._packed, position, velocity, covariance, widest)
+        return NavSolution(
+            time_s=time_s,
+            available=self._used | (widest <= self._model.coast_sigma_m**2),
+            position=position,
+            velocity=velocity,
+            attitude=attitude,
+            body_rates=body_rates,
+            covariance=covariance,
+            common_factor=np.zeros((runs, uavs, 3, 1)),
+            filtered=True,
+            forecast=self._ahead(),
+        )
+
+    def _ahead(self) -> CovarianceForecast:
+        """How the variance goes on if the density is normal and a fix is worth a Student law's information.
+
+        To the forecast's filter each fix has a white error then, its variance the reported one times
+        (nu + 3) / (nu + 1) over the weight of its likelihood.
+        """
+        model = self._model
+        kept = model.error_memory**self._epochs_per_new
+        law = (self._degrees + 3.0) / (self._degrees + 1.0)
+        with np.errstate(divide="ignore"):
+            factor = np.minimum(law * (1.0 + kept) / (1.0 - kept), UNINFORMATIVE)
+        kalmans = model.fixless_axis
+        packed = self._packed.copy()
+        packed[..., ~kalmans, 7] = factor[~kalmans]
+        return CovarianceForecast(
+            replace(
+                self._forecast,
+                error_memory=np.where(kalmans, model.error_memory, 0.0),
+                error_noise=np.where(kalmans, model.error_noise, factor),
+            ),
+            packed,
+            self._sigma,
+            self._used,
+            self._age,
+            max(1, self._epochs_per_new - self._epochs_since_new),
+            self._epochs_per_new,
+        )
