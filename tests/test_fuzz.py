@@ -246,7 +246,8 @@ def families() -> dict[str, Tables]:
     found["forest"] = table1 | {"world": {"kind": "forest"}}
     found["constant"] = table1 | {"navigation": {"kind": "constant"}}
     found["outages"] = table1 | {"navigation": {"kind": "gauss_markov", "outage_interval_s": 20.0}}
-    found["filter"] = table1 | {"navigation": {"filter": "kalman", "outage_interval_s": 5.0}}
+    for name in ("kalman", "point_mass"):
+        found[name] = table1 | {"navigation": {"filter": name, "outage_interval_s": 5.0}}
     found["solids"] = table1 | {"world": {"kind": "list", "obstacles": SOLIDS}}
     found["walk in a random world"] = walk | {"world": {"kind": "scatter"}}
     # Errors are drawn for the whole time limit: a short one is quicker to draw.

@@ -40,7 +40,7 @@ def _is_built(navigation_filter: str) -> bool:
     return True
 
 
-FILTERS = [name for name in ("none", "kalman") if _is_built(name)]
+FILTERS = [name for name in ("none", "kalman", "point_mass") if _is_built(name)]
 
 
 @cache

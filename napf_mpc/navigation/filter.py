@@ -78,6 +78,12 @@ class FilterModel:
     """(3,) correlation of the fix's error from one epoch to the next, on each axis."""
     error_noise: Array
     """(3,) variance of what is new in the unit error, 1 - memory^2."""
+    error_rate_hz: Array
+    """(3,) one over the error's correlation time [1/s]."""
+    error_rate_standing_hz: float
+    """The same where an error of the place meets a UAV that stands [1/s]; infinite for one of time."""
+    error_rate_per_m: float
+    """What each metre of the way adds to it [1/m]."""
     common_share: Array
     """(3,) share of the fix's error variance that UAVs have in common."""
     fixless_axis: Mask
@@ -120,12 +126,20 @@ class FilterModel:
         if isinstance(navigation, Recorded) and barometer:
             times[2] = navigation.barometer_correlation_time_s
             share[2] = 0.0
-        lags = np.array([period_s * ticks_per_epoch / time if time > 0.0 else math.inf for time in times])
+        rates = np.array([1.0 / time if time > 0.0 else math.inf for time in times])
+        lags = period_s * ticks_per_epoch * rates
+        standing, per_m = math.inf, 0.0
+        if isinstance(navigation, Gnss):
+            standing = 1.0 / navigation.filter_standing_time_s
+            per_m = 1.0 / navigation.filter_correlation_length_m
         return cls(
             period_s=period_s,
             ticks_per_epoch=ticks_per_epoch,
             error_memory=np.exp(-lags),
             error_noise=-np.expm1(-2.0 * lags),
+            error_rate_hz=rates,
+            error_rate_standing_hz=standing,
+            error_rate_per_m=per_m,
             common_share=share,
             fixless_axis=np.array([False, False, barometer]),
             coupled=isinstance(navigation, Recorded | Gnss),

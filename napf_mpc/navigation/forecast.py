@@ -36,7 +36,7 @@ class ForecastModel:
     error_memory: Array
     """(3,) correlation of the fix's error from one epoch to the next, on each axis."""
     error_noise: Array
-    """(3,) variance of what is new in the unit error."""
+    """(3,) or (run, uav, 3) variance of what is new in the unit error."""
     fixless_axis: Mask
     """(3,) axes that are measured without a fix too (a barometer's)."""
     position_noise: float
@@ -114,7 +114,7 @@ class CovarianceForecast:
             self.epochs_to_new,
             self.epochs_per_new,
             model.error_memory,
-            model.error_noise,
+            np.ascontiguousarray(np.broadcast_to(model.error_noise, self.sigma.shape)),
             model.position_noise,
             model.velocity_noise,
             out,
@@ -177,7 +177,7 @@ def variance_ahead(
         From :func:`drifts`.
     ticks_to_epoch, epochs_to_new, epochs_per_new : int
         When measurements come.
-    error_memory, error_noise : array, shape (3,)
+    error_memory, error_noise : array, shapes (3,) and (run, uav, 3)
         Of the fix's error from one epoch to the next.
     position_noise, velocity_noise : float
         Variances of the white noise in position [m^2] and velocity [m^2/s^2].
@@ -209,7 +209,7 @@ def variance_ahead(
                     to_new -= 1
                     fix = fixes[r, i] and to_new == 0
                     for a in range(3):
-                        _forget(c, a, error_memory[a], error_noise[a])
+                        _forget(c, a, error_memory[a], error_noise[r, i, a])
                         if usable[a] and (fix or fixless_axis[a]):
                             _measured(c, a, 1.0, 0.0, sigma[r, i, at, a], position_noise)
                         if usable[a] and fix:

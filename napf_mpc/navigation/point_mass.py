@@ -7,9 +7,9 @@ reckoning adds, and is multiplied by the likelihood of each fix, a Student law w
 freedom and the reported sigma as its scale, to the power :math:`w`:
 
 .. math:: p(x) \leftarrow p(x) \left(1 + \frac{(z - x)^2}{\nu \sigma^2}\right)^{-w (\nu + 1) / 2},
-          \qquad w = \frac{1 - \phi^n}{1 + \phi^n},
+          \qquad w = \frac{1 - \phi}{1 + \phi} = \tanh\frac{\lambda}{2},
 
-:math:`\phi` the correlation of the fix's error over an epoch, n epochs since the last fix. A mean of fixes
+:math:`\phi = e^{-\lambda}` the correlation of the fix's error with that of the last fix. A mean of fixes
 whose errors are correlated so is worth w times as many that are not, so their likelihood counts w times.
 
 Mean and variance of the density go back to the dead reckoning. Velocity and bias are estimated without the
@@ -55,7 +55,7 @@ def correct(
     density: Array,
     grids: Array,
     astray: Array,
-    since: NDArray[np.int64],
+    lag: Array,
     fix_position: Array,
     fix_velocity: Array,
     fix_sigma: Array,
@@ -63,6 +63,7 @@ def correct(
     fixless_axis: Mask,
     error_memory: Array,
     error_noise: Array,
+    change: Array,
     degrees: float,
     position_noise: float,
     velocity_noise: float,
@@ -87,8 +88,8 @@ def correct(
         Distance of two nodes, and of the middle node from the estimate [m]; overwritten.
     astray : array, shape (run, uav, 3)
         Evidence that the UAV is far beyond the grid; overwritten.
-    since : array of int, shape (run, uav, 3)
-        Epochs since the last measured position; overwritten.
+    lag : array, shape (run, uav, 3)
+        Time since the last measured position, in correlation times; overwritten.
     fix_position, fix_velocity, fix_sigma : array, shape (run, uav, 3)
         Measured position [m] and velocity [m/s], reported sigma of the position [m].
     has_fix : array of bool, shape (run, uav)
@@ -98,7 +99,9 @@ def correct(
         tails, and only a filter that has the error as a state takes from them how fast a UAV climbs: such an
         axis is the Kalman filter's.
     error_memory, error_noise : array, shape (3,)
-        phi and 1 - phi^2 of the fix's error from one epoch to the next.
+        phi and 1 - phi^2 of the fix's error from one epoch to the next, of the Kalman filter's axes.
+    change : array, shape (run, uav, 3)
+        How far the fix's error changes in this epoch, in correlation times.
     degrees : float
         nu, degrees of freedom of the Student law.
     position_noise : float
@@ -121,7 +124,7 @@ def correct(
         for i in range(mean.shape[1]):
             usable = has_fix[r, i]
             for a in range(3):
-                since[r, i, a] += 1
+                lag[r, i, a] += change[r, i, a]
                 usable = usable and is_measured(fix_position[r, i, a], fix_sigma[r, i, a])
                 usable = usable and np.isfinite(fix_velocity[r, i, a])
                 if usable and not restart[r, i]:
@@ -150,15 +153,14 @@ def correct(
                     x[1], x[3] = speed, 0.0
                     c[4], c[6], c[9] = velocity_noise, 0.0, bias_variance
                     _lay(x, c, p, grid, place, sigma, degrees)
-                    astray[r, i, a], since[r, i, a] = 0.0, 0
+                    astray[r, i, a], lag[r, i, a] = 0.0, 0.0
                     continue
                 # Widened only now: of what an outage adds, the first velocity after it takes much away again.
                 if verdict[r, i] == USED:
                     _take_in_velocity(x, c, speed, velocity_noise)
                     prior = _widen(p, spare, grid, c[0])
-                    kept = error_memory[a] ** since[r, i, a]
-                    weight = (1.0 - kept) / (1.0 + kept)
-                    since[r, i, a] = 0
+                    weight = np.tanh(0.5 * lag[r, i, a])
+                    lag[r, i, a] = 0.0
                     astray[r, i, a] += _beyond(grid, place - x[0], sigma, degrees, weight)
                     if astray[r, i, a] > -LOG_FLOOR:
                         _lay(x, c, p, grid, place, sigma, degrees)

@@ -7,7 +7,9 @@ possibility that raises the variance, and fades or takes over with what comes af
 
 It is given the same measurements and takes the same as known, but for the error of a fix: that has a Student
 law with ``student_degrees_of_freedom`` and the reported sigma as its scale, and is worth what its
-correlation time leaves of it. What a known change of sigma would tell of a Gauss-Markov error is not used.
+correlation leaves of it: over time, and of emulated receivers over the way flown as well
+(``filter_correlation_length_m``, ``filter_standing_time_s``). What a known change of sigma would tell of a
+Gauss-Markov error is not used.
 
 Axes are filtered apart, and what UAVs have in common is not told: their relative covariance is the sum.
 """
@@ -60,14 +62,18 @@ class PointMassFilter:
         self._density = np.full((*shape, point_mass.NODES), 1.0 / point_mass.NODES)
         self._grids = np.ones((*shape, 2))
         self._astray = np.zeros(shape)
-        self._since = np.zeros(shape, dtype=np.int64)
+        self._lag = np.zeros(shape)
         self._verdict = np.zeros((runs, uavs), dtype=np.int8)
         self._begun, self._used = (np.zeros((runs, uavs), dtype=np.bool_) for _ in range(2))
         self._refused_s = np.zeros((runs, uavs))
         self._refused_fixes, self._missed_fixes = (np.zeros((runs, uavs), dtype=np.int64) for _ in range(2))
         self._sigma = np.full(shape, np.nan)
         self._age, self._epochs_since_new, self._epochs_per_new = 0, 1, 1
-        self._forecast = model.forecast()
+        self._forecast = replace(
+            model.forecast(), error_memory=np.where(model.fixless_axis, model.error_memory, 0.0)
+        )
+        self._law = (degrees + 3.0) / (degrees + 1.0)
+        self._noise = np.ones(shape)
 
     @property
     def refused_fixes(self) -> NDArray[np.int64]:
@@ -99,17 +105,19 @@ class PointMassFilter:
         first = not self._begun.any()
         has_fix = (available | first) & (new | first)
         self._missed_fixes += new & ~available & active[:, None]
+        change = self._change()
         begins = ~self._begun | (self._refused_s >= GATE_PATIENCE_S - 1e-9)
         point_mass.correct(
-            self._mean, self._packed, self._density, self._grids, self._astray, self._since,
+            self._mean, self._packed, self._density, self._grids, self._astray, self._lag,
             position, velocity, sigma, has_fix, model.fixless_axis, model.error_memory, model.error_noise,
-            self._degrees, RECEIVER_NOISE_M**2, model.velocity_sigma_mps**2, model.bias_sigma_mps2**2,
+            change, self._degrees, RECEIVER_NOISE_M**2, model.velocity_sigma_mps**2, model.bias_sigma_mps2**2,
             model.gate, begins, active, self._verdict,
         )  # fmt: skip
         self._age, self._sigma = 0, sigma
         self._epochs_since_new += 1
         if new:
             self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
+        self._noise = self._white_noise(change)
         usable = np.isfinite(position) & np.isfinite(velocity) & np.isfinite(sigma) & (sigma > 0.0)
         self._note_verdict(available, np.asarray(usable.all(-1)), active[:, None])
 
@@ -143,26 +151,33 @@ class PointMassFilter:
             forecast=self._ahead(),
         )
 
-    def _ahead(self) -> CovarianceForecast:
-        """How the variance goes on if the density is normal and a fix is worth a Student law's information.
+    def _change(self) -> Array:
+        """(run, uav, 3) correlation times by which the fix's error changes in an epoch.
 
-        To the forecast's filter each fix has a white error then, its variance the reported one times
-        (nu + 3) / (nu + 1) over the weight of its likelihood.
+        Where the error is one of the place, as a reflection's, it stays while a UAV stands.
         """
         model = self._model
-        kept = model.error_memory**self._epochs_per_new
-        law = (self._degrees + 3.0) / (self._degrees + 1.0)
+        speed = np.linalg.norm(self._mean[..., 1], axis=-1)
+        by_place = model.error_rate_standing_hz + model.error_rate_per_m * np.nan_to_num(speed, nan=0.0)
+        rate = np.minimum(model.error_rate_hz, by_place[..., None])
+        return np.asarray(model.period_s * model.ticks_per_epoch * rate)
+
+    def _white_noise(self, change: Array) -> Array:
+        """(run, uav, 3) factor on a fix's variance that makes white noise of it, worth as much as it is here.
+
+        A Student law has (nu + 1) / (nu + 3) of a normal one's information, and fixes count by weight.
+        """
+        model = self._model
         with np.errstate(divide="ignore"):
-            factor = np.minimum(law * (1.0 + kept) / (1.0 - kept), UNINFORMATIVE)
-        kalmans = model.fixless_axis
+            factor = self._law / np.tanh(0.5 * self._epochs_per_new * change)
+        return np.where(model.fixless_axis, model.error_noise, np.minimum(factor, UNINFORMATIVE))
+
+    def _ahead(self) -> CovarianceForecast:
+        """How the variance goes on if the density is normal and the speed that of now."""
         packed = self._packed.copy()
-        packed[..., ~kalmans, 7] = factor[~kalmans]
+        packed[..., 7] = np.where(self._model.fixless_axis, packed[..., 7], self._noise)
         return CovarianceForecast(
-            replace(
-                self._forecast,
-                error_memory=np.where(kalmans, model.error_memory, 0.0),
-                error_noise=np.where(kalmans, model.error_noise, factor),
-            ),
+            replace(self._forecast, error_noise=self._noise),
             packed,
             self._sigma,
             self._used,

@@ -191,6 +191,10 @@ class Gnss(_NavigationBase):
     """Protection levels: chance that a satellite is faulty."""
     filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] = 2.0
     """Filter: correlation time that it assumes of the error but for what UAVs have in common, which lasts."""
+    filter_correlation_length_m: float = Field(5.0, ge=0.1, le=1e4)
+    """Point-mass filter: way of a UAV over which the error changes, if that takes longer than ``filter_correlation_time_s``."""  # noqa: E501
+    filter_standing_time_s: float = Field(60.0, ge=0.1, le=1e6)
+    """Point-mass filter: correlation time that it assumes of the error of a UAV that stands."""
     credit: str = Field("", max_length=500)
     """Source and licence, printed on every figure."""
 

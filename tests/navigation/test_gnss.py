@@ -297,7 +297,7 @@ def test_a_missing_navigation_file_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("planner", ["apf", "napf", "qp"])
-@pytest.mark.parametrize("filter_", ["none", "kalman"])
+@pytest.mark.parametrize("filter_", ["none", "kalman", "point_mass"])
 def test_it_flies_with_every_planner_whatever_the_block(planner: str, filter_: str) -> None:
     problem = load_problem(
         "street_canyon_gnss", [f'navigation.filter="{filter_}"', "simulation.time_limit_s=4"]
@@ -313,7 +313,7 @@ def test_it_flies_with_every_planner_whatever_the_block(planner: str, filter_: s
 
 
 def test_what_uavs_share_reaches_the_planner_through_the_filter_and_without() -> None:
-    for filter_ in ("none", "kalman"):
+    for filter_ in ("none", "kalman", "point_mass"):
         problem = load_problem("street_canyon_gnss", [f'navigation.filter="{filter_}"'])
         scenario = build_scenario(problem, 2, range(2))
         fix = scenario.errors.begin().fix(0, scenario.initial_state[..., 0:6:2])  # type: ignore[union-attr]
@@ -335,9 +335,10 @@ def test_the_loop_asks_at_the_true_places() -> None:
         np.testing.assert_allclose(told - true, fixes.fix(epoch, true).error, atol=1e-9)
 
 
-def test_a_filter_takes_out_what_changes_and_says_that_the_rest_stays() -> None:
+@pytest.mark.parametrize("filter_", ["kalman", "point_mass"])
+def test_a_filter_takes_out_what_changes_and_says_that_the_rest_stays(filter_: str) -> None:
     """Standing under an open sky for 20 s: error over reported sigma is 1, far more without L L^T."""
-    cfg = config(rate_hz=10.0, filter="kalman", believed_reflection_m=0.0, code_noise_m=1.0)
+    cfg = config(rate_hz=10.0, filter=filter_, believed_reflection_m=0.0, code_noise_m=1.0)
     runs = range(100)
     errors = GnssErrors(scene(cfg, runs), 3, runs, 2)
     still = np.zeros((100, 2, 3))

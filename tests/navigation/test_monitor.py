@@ -135,7 +135,8 @@ def test_a_fifth_of_the_sigma_is_flagged_in_time_and_in_the_results() -> None:
 
 def test_disputes_are_told_among_the_events() -> None:
     """Between houses positions jump: who holds when, and until when, stands in the results."""
-    street = load_problem("street_canyon_gnss", [WATCHED, "simulation.time_limit_s=60"])
+    settings = ['navigation.filter="kalman"', WATCHED, "simulation.time_limit_s=60"]
+    street = load_problem("street_canyon_gnss", settings)
     events = fly_block(street, ["napf"], 301, range(4)).events
     disputes = ["fixes" in str(cause) for cause in events["cause"]]
     turns = list(zip(events["run"], events["uav"], events["t_s"], events["action"], strict=True))
@@ -164,5 +165,5 @@ def test_the_filter_says_more_of_what_it_is_worth() -> None:
 
 
 def test_without_a_filter_there_is_nothing_to_watch() -> None:
-    with pytest.raises(ProblemError, match="watches a filter's innovations"):
+    with pytest.raises(ProblemError, match="watches the Kalman filter's innovations"):
         load_problem("study_8s", [WATCHED])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from napf_mpc.navigation.filter import FilterModel, KalmanFilter
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.solution import NavSolution
-from napf_mpc.problem import GaussMarkov, Recorded
+from napf_mpc.problem import GaussMarkov, Gnss, Recorded
 from napf_mpc.problem_file import load_problem
 
 Array = NDArray[np.float64]
@@ -145,6 +145,19 @@ def test_correlated_fixes_count_as_many_as_they_are_worth() -> None:
     for _ in range(801):
         nav = standing.fed(0.0, 3.0)
     assert sigma_of(nav) == pytest.approx(3.0 / math.sqrt(1.0 + 80.0 / 8.0), rel=0.02)
+
+
+@pytest.mark.parametrize(("speed_mps", "time_s"), [(0.0, 60.0), (1.0, 2.754), (6.0, 2.0)])
+def test_a_receiver_that_stands_keeps_its_error(speed_mps: float, time_s: float) -> None:
+    """Emulated ones: the error lasts 60 s, or 5 m of the way; two seconds at least. Speed is on each axis."""
+    config = Gnss.model_validate({"kind": "gnss", "filter": "point_mass"} | EXACT)
+    standing = Standing(PointMassFilter(FilterModel.of_navigation(config, EPOCH_S, 1), 1e6, 1, 1))
+    for n in range(401):
+        nav = standing.fed(speed_mps * n * EPOCH_S, 3.0, velocity=speed_mps)
+    assert sigma_of(nav) == pytest.approx(3.0 / math.sqrt(1.0 + 40.0 / (2.0 * time_s)), rel=0.02)
+    assert nav.forecast is not None
+    then = 1.0 / (1.0 / sigma_of(nav) ** 2 + 10.0 / (2.0 * time_s * 9.0))
+    assert nav.forecast.variance(np.array([10.0]), True)[0, 0, 0, 0] == pytest.approx(then, rel=0.03)
 
 
 def test_an_error_that_never_changes_is_measured_once() -> None:

@@ -1,0 +1,113 @@
+"""What the navigation filters make of emulated receivers: errors, and what is claimed of them.
+
+    python benchmarks/navigation_filters.py [--problem nishi_shinjuku_gnss --data DIR] [--runs N] [--seed S]
+
+UAVs stay in their slots at the reference speed, no planner; runs have their own times of the day, all filters
+have the same fixes. ``--set`` changes the problem, as ``navigation.reported_sigma_scale=0.5``. Errors and
+shares are of a moment a second, from the first on; those of a run are correlated, so only the share of runs
+has an interval.
+"""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from napf_mpc.closed_loop import build_scenario, formation_mission
+from napf_mpc.formation import PathFrame, formation_offsets
+from napf_mpc.navigation.filtered import FilteredNavigation
+from napf_mpc.navigation.gnss_fixes import GnssErrors
+from napf_mpc.problem import Problem
+from napf_mpc.problem_file import load_problem
+from napf_mpc.risk import wilson
+
+Array = NDArray[np.float64]
+
+FILTERS = {
+    "kalman": {"navigation.filter": "kalman"},
+    "kalman, watched": {"navigation.filter": "kalman", "navigation.monitor": "innovations"},
+    "point_mass": {"navigation.filter": "point_mass"},
+}
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a filter told, a moment a second."""
+
+    error: Array
+    """(t, run, uav, 3)"""
+    covariance: Array
+    """(t, run, uav, 3, 3)"""
+    refused: NDArray[np.int64]
+    """(run,)"""
+
+
+def flown(problem: Problem, errors: GnssErrors, seed: int, runs: int) -> Told:
+    """All UAVs along their lanes."""
+    mission = formation_mission(problem)
+    frame, offsets = PathFrame.of_mission(mission), formation_offsets(problem.formation)
+    tick_s = 1.0 / problem.simulation.controller_rate_hz
+    ticks_per_fix = round(problem.simulation.controller_rate_hz / problem.navigation.rate_hz)
+    along = frame.to_world(np.array([[1.0, 0.0, 0.0]])) - frame.to_world(np.zeros((1, 3)))
+    speed = np.broadcast_to(mission.speed_mps * along, (runs, len(offsets), 3))
+    still, active = np.zeros(speed.shape), np.ones(runs, dtype=bool)
+    navigation = FilteredNavigation(
+        problem.navigation, errors, seed, range(runs), tick_s, ticks_per_fix, speed
+    )
+    error, covariance = [], []
+    for tick in range(int(mission.length_m / mission.speed_mps / tick_s)):
+        slots = offsets + np.array([mission.speed_mps * tick * tick_s, 0.0, 0.0])
+        position = np.repeat(frame.to_world(slots)[None], runs, axis=0)
+        told = navigation.solution(tick, tick * tick_s, position, speed, still, still, active)
+        if tick % round(1.0 / tick_s) == 0:
+            error.append(told.position - position)
+            covariance.append(told.position_covariance.copy())
+    return Told(np.array(error), np.array(covariance), navigation.gated_fixes)
+
+
+def row(label: str, told: Told) -> str:
+    """One line of the table."""
+    e, c = told.error, told.covariance
+    across, up = np.hypot(e[..., 0], e[..., 1]), np.abs(e[..., 2])
+    sigma = np.sqrt(np.einsum("...aa->...a", c))
+    nees = np.einsum("...a,...ab,...b->...", e, np.linalg.inv(c), e) / 3.0
+    drms = np.hypot(sigma[..., 0], sigma[..., 1])
+    # Three sigma of a circle as wide as the ellipse is on average.
+    beyond = across - 3.0 * drms / np.sqrt(2.0)
+    runs = e.shape[1]
+    lost = wilson(int((beyond > 2.0).any(axis=(0, 2)).sum()), runs)
+    quantiles = " / ".join(f"{q:.1f}" for q in np.quantile(across, [0.5, 0.95, 0.999]))
+    return (
+        f"| {label} | {quantiles} | {np.quantile(up, 0.95):.1f} / {np.quantile(up, 0.999):.1f} "
+        f"| {np.median(drms):.1f} | {nees.mean():.2f} | {100 * (np.abs(e) < 3.0 * sigma).mean():.2f} % "
+        f"| {100 * lost.value:.0f} [{100 * lost.low:.0f}, {100 * lost.high:.0f}] % "
+        f"| {told.refused.mean():.0f} |"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--problem", default="street_canyon_gnss")
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=7200)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    options = parser.parse_args()
+    print(f"{options.problem}, N = {options.runs} runs, seed {options.seed} {' '.join(options.set)}")
+    print(
+        "| filter | H error, median / 95 % / 99.9 % [m] | U, 95 % / 99.9 % [m] | drms, median [m] | NEES "
+        "| within 3 sigma, axes | runs with a UAV 2 m beyond 3 sigma | refused a run |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    for label, settings in FILTERS.items():
+        overrides = [f"{key}={value}" for key, value in settings.items()]
+        problem = load_problem(options.problem, [*options.set, *overrides])
+        errors = build_scenario(problem, options.seed, range(options.runs), options.data).errors
+        assert isinstance(errors, GnssErrors)
+        print(row(label, flown(problem, errors, options.seed, options.runs)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
