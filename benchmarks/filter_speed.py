@@ -20,6 +20,7 @@ import numpy as np
 from napf_mpc.navigation.error_models import position_errors
 from napf_mpc.navigation.filter import FilterModel, KalmanFilter
 from napf_mpc.navigation.filtered import FilteredNavigation
+from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.sensors import Sensors
 from napf_mpc.problem import GaussMarkov
 
@@ -55,7 +56,7 @@ def table(navigation: GaussMarkov, runs: int, ticks: int) -> list[tuple[str, flo
     position, velocity, still = rng.normal(size=shape), rng.normal(size=shape), np.zeros(shape)
     errors = position_errors(navigation, 0, block, UAVS, (ticks + 20) * TICK_S, None)
     model = FilterModel.of_navigation(navigation, TICK_S, TICKS_PER_FIX)
-    kalman = KalmanFilter(model, runs, UAVS)
+    kalman, point_mass = KalmanFilter(model, runs, UAVS), PointMassFilter(model, 3.0, runs, UAVS)
     fix = errors.fix(0)
     sensors = Sensors(navigation, 0, block, UAVS, TICK_S, velocity)
     flown = FilteredNavigation(navigation, errors, 0, block, TICK_S, TICKS_PER_FIX, velocity)
@@ -63,11 +64,18 @@ def table(navigation: GaussMarkov, runs: int, ticks: int) -> list[tuple[str, flo
     def correct(_: int) -> None:
         kalman.correct(position, velocity, fix.covariance, fix.available, True, active)
 
+    def correct_density(_: int) -> None:
+        point_mass.correct(position, velocity, fix.covariance, fix.available, True, active)
+
     def solve(tick: int) -> None:
         flown.solution(tick, tick * TICK_S, position, velocity, still, still, active)
 
     return [
         ("take in a fix (a fifth of it per tick)", microseconds(correct, ticks // 5, uavs) / TICKS_PER_FIX),
+        (
+            "the same, point-mass filter",
+            microseconds(correct_density, ticks // 5, uavs) / TICKS_PER_FIX,
+        ),
         ("carry over a tick", microseconds(lambda _: kalman.predict(still, active), ticks, uavs)),
         ("issue the solution", microseconds(lambda _: kalman.solution(0.0, still, still), ticks, uavs)),
         ("draw accelerometers", microseconds(lambda _: sensors.velocity_change(velocity), ticks, uavs)),

@@ -12,6 +12,7 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +20,7 @@ from napf_mpc.closed_loop import build_scenario, formation_mission
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.navigation.filtered import FilteredNavigation
 from napf_mpc.navigation.gnss_fixes import GnssErrors
+from napf_mpc.plot.style import BLUE, VERMILION, house_style
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.risk import wilson
@@ -87,6 +89,30 @@ def row(label: str, told: Told) -> str:
     )
 
 
+def figure(tolds: dict[str, Told], path: Path) -> None:
+    """Save the error of the UAV that the Kalman filter lost farthest, and the tails of all."""
+    far = np.abs(tolds["kalman"].error[..., 0])
+    lost = np.unravel_index(far.max(axis=0).argmax(), far.shape[1:])
+    with house_style():
+        drawn, (left, right) = plt.subplots(1, 2, figsize=(7.2, 2.6), layout="constrained")
+        for name, label, colour in (("kalman", "Kalman", VERMILION), ("point_mass", "point-mass", BLUE)):
+            told = tolds[name]
+            error, band = told.error[:, *lost, 0], 3.0 * np.sqrt(told.covariance[:, *lost, 0, 0])
+            seconds = np.arange(len(error))
+            left.plot(seconds, error, color=colour, label=label)
+            left.fill_between(seconds, -band, band, color=colour, alpha=0.15, linewidth=0.0)
+            across = np.sort(np.hypot(told.error[..., 0], told.error[..., 1]).ravel())
+            beyond = 1.0 - np.arange(len(across)) / len(across)
+            right.semilogy(across, beyond, color=colour, label=label)
+        left.set(xlabel="time (s)", ylabel="error east (m)", xlim=(0.0, seconds[-1]))
+        left.set_title("one UAV, and 3 sigma as reported by either")
+        right.set(xlabel="horizontal error (m)", ylabel="share beyond", xlim=(0.0, None), ylim=(1e-4, 1.0))
+        right.set_title("all UAVs")
+        left.legend()
+        right.legend()
+        drawn.savefig(path, dpi=200)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--problem", default="street_canyon_gnss")
@@ -94,6 +120,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=7200)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="save errors over time and their tails")
     options = parser.parse_args()
     print(f"{options.problem}, N = {options.runs} runs, seed {options.seed} {' '.join(options.set)}")
     print(
@@ -101,12 +128,16 @@ def main() -> None:
         "| within 3 sigma, axes | runs with a UAV 2 m beyond 3 sigma | refused a run |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    tolds: dict[str, Told] = {}
     for label, settings in FILTERS.items():
         overrides = [f"{key}={value}" for key, value in settings.items()]
         problem = load_problem(options.problem, [*options.set, *overrides])
         errors = build_scenario(problem, options.seed, range(options.runs), options.data).errors
         assert isinstance(errors, GnssErrors)
-        print(row(label, flown(problem, errors, options.seed, options.runs)), flush=True)
+        tolds[label] = flown(problem, errors, options.seed, options.runs)
+        print(row(label, tolds[label]), flush=True)
+    if options.figure:
+        figure(tolds, options.figure)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ LOG_FLOOR = -40.0
 FLOOR = np.exp(LOG_FLOOR)
 """Least density of a place over the largest. None is ever ruled out for good, on the grid or beyond it, so a
 wrong estimate can be left again: six independent fixes that are ten sigmas off outweigh it."""
-FAR = 10.0
+FAR = 5.0
 """Sigmas from the estimate beyond which a fix that the grid does not reach speaks for another place."""
 WIDEST_PASS = 0.5
 """Variance in squared steps that one pass of the three-point kernel adds at most."""
