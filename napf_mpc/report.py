@@ -32,7 +32,7 @@ METRIC_LABELS = {
     "within_k_sigma_up": "  up",
     "nees": "filter's NEES (1 is consistent)",
     "nees_position": "  of the position alone",
-    "gated_fixes": "fixes refused by the filter",
+    "gated_fixes": "fixes refused or outvoted",
     "missed_fixes": "fixes that did not come",
     "monitor_alarms": "alarms of the monitor of innovations",
     "monitor_scale": "  largest factor on a reported sigma",

@@ -25,13 +25,15 @@ from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation import kalman
 from napf_mpc.navigation.kalman import BEGUN, NO_FIX, REFUSED, STATES, USED, is_measured
 
-__all__ = ["NODES", "correct"]
+__all__ = ["NODES", "OUTVOTED", "correct"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 NODES = 256
 """Nodes of an axis' grid."""
+OUTVOTED = 3
+"""Verdict on a fix that is used, but is beyond the gate of the estimate, so that it counts for little."""
 STEP, CENTRE = 0, 1
 """Numbers of a grid."""
 FINEST, COARSEST = 3.0, 12.0
@@ -109,13 +111,13 @@ def correct(
     velocity_noise, bias_variance : float
         Variances of the GNSS velocity [m^2/s^2], and of a bias of which nothing is known [m^2/s^4].
     gate : float
-        Largest innovation of the velocity in its sigmas; 0 for none.
+        Largest innovation of the velocity in its sigmas, and of a position that counts in full; 0 for none.
     restart : array of bool, shape (run, uav)
         UAVs that forget all they knew and begin with this fix, if it can be used.
     active : array of bool, shape (run,)
         Runs that fly.
     verdict : array of int8, shape (run, uav)
-        Out: as in :func:`napf_mpc.navigation.kalman.correct`.
+        Out: as in :func:`napf_mpc.navigation.kalman.correct`, or :data:`OUTVOTED`.
     """
     spare, full, gain = np.empty(NODES), np.empty((STATES, STATES)), np.empty(STATES)
     for r in range(mean.shape[0]):
@@ -134,6 +136,7 @@ def correct(
             verdict[r, i] = NO_FIX
             if has_fix[r, i]:
                 verdict[r, i] = REFUSED if not usable else BEGUN if restart[r, i] else USED
+            used, outvoted = verdict[r, i] == USED, False
             for a in range(3):
                 x, c, p, grid = mean[r, i, a], packed[r, i, a], density[r, i, a], grids[r, i, a]
                 place, speed, sigma = fix_position[r, i, a], fix_velocity[r, i, a], fix_sigma[r, i, a]
@@ -142,7 +145,7 @@ def correct(
                     kalman.forget(x, c, error_memory[a], error_noise[a])
                     if verdict[r, i] == BEGUN:
                         kalman.begin(x, c, place, speed, sigma, position_noise, velocity_noise, bias_variance)
-                    elif alone or verdict[r, i] == USED:
+                    elif alone or used:
                         kalman.unpack(c, full)
                         kalman.take_in(x, full, gain, place, 1.0, 0.0, sigma, position_noise)
                         if not alone:
@@ -156,22 +159,25 @@ def correct(
                     astray[r, i, a], lag[r, i, a] = 0.0, 0.0
                     continue
                 # Widened only now: of what an outage adds, the first velocity after it takes much away again.
-                if verdict[r, i] == USED:
+                if used:
                     _take_in_velocity(x, c, speed, velocity_noise)
+                    off, spread = place - x[0], c[0] + sigma * sigma
+                    outvoted = outvoted or (gate > 0.0 and off * off > gate * gate * spread)
                     prior = _widen(p, spare, grid, c[0])
                     weight = np.tanh(0.5 * lag[r, i, a])
                     lag[r, i, a] = 0.0
-                    astray[r, i, a] += _beyond(grid, place - x[0], sigma, degrees, weight)
+                    astray[r, i, a] += _beyond(grid, off, sigma, degrees, weight)
                     if astray[r, i, a] > -LOG_FLOOR:
                         _lay(x, c, p, grid, place, sigma, degrees)
                         astray[r, i, a] = 0.0
                         continue
                     astray[r, i, a] = max(astray[r, i, a], 0.0)
-                    _sharpen(p, spare, grid, place - x[0], sigma, degrees, weight)
-                    miss = place - x[0] - grid[CENTRE]
-                    _weigh(p, miss, grid[STEP], sigma, degrees, weight)
+                    _sharpen(p, spare, grid, off, sigma, degrees, weight)
+                    _weigh(p, off - grid[CENTRE], grid[STEP], sigma, degrees, weight)
                     _settle(x, c, p, grid, prior)
                     _fit_grid(p, spare, grid, c[0])
+            if outvoted:
+                verdict[r, i] = OUTVOTED
 
 
 @compiled_bare

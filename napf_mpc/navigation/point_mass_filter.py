@@ -77,7 +77,11 @@ class PointMassFilter:
 
     @property
     def refused_fixes(self) -> NDArray[np.int64]:
-        """(run, uav) number of fixes refused so far, by the gate of the velocity or as unusable."""
+        """(run, uav) number of fixes so far that were refused, or outvoted.
+
+        Refused are unusable ones and those with a velocity beyond the gate; a position beyond the gate is
+        outvoted: it is used, and counts for little.
+        """
         return self._refused_fixes.copy()
 
     @property
@@ -124,9 +128,10 @@ class PointMassFilter:
     def _note_verdict(self, available: Mask, usable: Mask, flying: Mask) -> None:
         verdict = self._verdict
         begun, refused = (verdict == kalman.BEGUN) & flying, (verdict == kalman.REFUSED) & flying
-        used = ((verdict == kalman.USED) & flying) | begun
+        outvoted = (verdict == point_mass.OUTVOTED) & flying
+        used = ((verdict == kalman.USED) & flying) | begun | outvoted
         self._begun |= begun
-        self._refused_fixes += refused
+        self._refused_fixes += refused | outvoted
         self._used = (self._used | used) & ~refused & available
         waiting = available & usable & ~self._used & flying
         epoch_s = self._model.period_s * self._model.ticks_per_epoch

@@ -198,8 +198,8 @@ def test_a_wrong_beginning_is_left() -> None:
     assert sigma_of(nav) < 3.0
 
 
-@pytest.mark.parametrize("size_m", [5.0, 10.0, 30.0])
-def test_a_jump_moves_it_little_and_it_returns(size_m: float) -> None:
+@pytest.mark.parametrize(("size_m", "outvoted"), [(5.0, (0, 0)), (15.0, (20, 100)), (30.0, (90, 100))])
+def test_a_jump_moves_it_little_and_it_returns(size_m: float, outvoted: tuple[int, int]) -> None:
     """After 30 s of good fixes a jump of 10 s, five correlation times: within 3 of its own sigmas always."""
     standing, random = point_mass(2.0), np.random.default_rng(4)
     for n in range(600):
@@ -208,6 +208,8 @@ def test_a_jump_moves_it_little_and_it_returns(size_m: float) -> None:
         if n > 50:
             assert np.abs(nav.position).max() < 3.0 * sigma_of(nav)
     assert np.abs(nav.position).max() < 1.0
+    # The jump is told, where it is beyond 5 sigma of fix and estimate.
+    assert outvoted[0] <= standing.filter.refused_fixes.item() <= outvoted[1]
 
 
 def test_a_place_long_believed_is_left_after_six_independent_fixes() -> None:
