@@ -127,7 +127,7 @@ class FilterModel:
             times[2] = navigation.barometer_correlation_time_s
             share[2] = 0.0
         rates = np.array([1.0 / time if time > 0.0 else math.inf for time in times])
-        lags = period_s * ticks_per_epoch * rates
+        lags = np.array([period_s * ticks_per_epoch / time if time > 0.0 else math.inf for time in times])
         standing, per_m = math.inf, 0.0
         if isinstance(navigation, Gnss):
             standing = 1.0 / navigation.filter_standing_time_s
