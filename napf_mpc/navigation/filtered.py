@@ -83,7 +83,7 @@ class FilteredNavigation:
 
     @property
     def gated_fixes(self) -> NDArray[np.int64]:
-        """(run,) number of fixes that were refused so far, of all UAVs."""
+        """(run,) number of fixes that were refused or outvoted so far, of all UAVs."""
         return np.asarray(self._filter.refused_fixes.sum(axis=-1), dtype=np.int64)
 
     @property

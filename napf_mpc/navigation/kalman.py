@@ -189,7 +189,7 @@ def correct(
                     witness &= measured
                     if not begins:
                         steady = _inside(speed - x[1], c[4] + velocity_noise, gate)
-                        usable &= _position_inside(x, c, place, sigma, position_noise, gate) and steady
+                        usable &= position_inside(x, c, place, sigma, position_noise, gate) and steady
                         usable &= not barred[r, i]
                         if follows[r, i]:
                             near = _inside(place - x[0] - sigma * x[2], c[0], PULL)
@@ -209,7 +209,7 @@ def correct(
                         response[r, i, a, 0], response[r, i, a, 2] = -sigma, 1.0
                     continue
                 alone = not fresh and fixless_axis[a] and is_measured(place, sigma)
-                alone = alone and _position_inside(x, c, place, sigma, position_noise, gate)
+                alone = alone and position_inside(x, c, place, sigma, position_noise, gate)
                 spoken = witness and verdict[r, i] == REFUSED
                 if not (alone or spoken or verdict[r, i] == USED):
                     continue
@@ -280,7 +280,8 @@ def is_measured(position: float, sigma: float) -> bool:
 
 
 @compiled_bare
-def _position_inside(x: Array, c: Array, position: float, sigma: float, noise: float, gate: float) -> bool:
+def position_inside(x: Array, c: Array, position: float, sigma: float, noise: float, gate: float) -> bool:
+    """Whether a measured position of an axis is inside the gate of what is expected."""
     spread = c[0] + 2.0 * sigma * c[2] + sigma * sigma * c[7] + noise
     return bool(_inside(position - x[0] - sigma * x[2], spread, gate))
 

@@ -36,6 +36,8 @@ OUTVOTED = 3
 """Verdict on a fix that is used, but is beyond the gate of the estimate, so that it counts for little."""
 STEP, CENTRE = 0, 1
 """Numbers of a grid."""
+EVIDENCE, PLACE = 0, 1
+"""Numbers of what is told of a place beyond it."""
 FINEST, COARSEST = 3.0, 12.0
 """Steps of the grid in one sigma of the density, at least and at most: it reaches 10 to 43 sigmas."""
 FIRST = 3.0
@@ -43,7 +45,7 @@ FIRST = 3.0
 LOG_FLOOR = -40.0
 FLOOR = np.exp(LOG_FLOOR)
 """Least density of a place over the largest. None is ever ruled out for good, on the grid or beyond it, so a
-wrong estimate can be left again: six independent fixes that are ten sigmas off outweigh it."""
+wrong estimate can be left again: six independent fixes that agree ten sigmas off outweigh it."""
 FAR = 5.0
 """Sigmas from the estimate beyond which a fix that the grid does not reach speaks for another place."""
 WIDEST_PASS = 0.5
@@ -78,7 +80,7 @@ def correct(
     """Take in one epoch of fixes, in place.
 
     A fix is refused as a whole if one of its numbers is not finite, if a sigma is not positive, or if its
-    velocity leaves ``gate`` of its own sigmas; its position is never too far away.
+    velocity, or a barometer's height, leaves ``gate`` of its own sigmas; its position is never too far away.
 
     Parameters
     ----------
@@ -88,8 +90,8 @@ def correct(
         Of the position on the nodes, with sum 1; overwritten.
     grids : array, shape (run, uav, 3, 2)
         Distance of two nodes, and of the middle node from the estimate [m]; overwritten.
-    astray : array, shape (run, uav, 3)
-        Evidence that the UAV is far beyond the grid; overwritten.
+    astray : array, shape (run, uav, 3, 2)
+        Evidence that the UAV is at a place far beyond the grid, and where from the estimate [m]; overwritten.
     lag : array, shape (run, uav, 3)
         Time since the last measured position, in correlation times; overwritten.
     fix_position, fix_velocity, fix_sigma : array, shape (run, uav, 3)
@@ -124,7 +126,7 @@ def correct(
         if not active[r]:
             continue
         for i in range(mean.shape[1]):
-            usable = has_fix[r, i]
+            usable, height_fits = has_fix[r, i], False
             for a in range(3):
                 lag[r, i, a] += change[r, i, a]
                 usable = usable and is_measured(fix_position[r, i, a], fix_sigma[r, i, a])
@@ -133,6 +135,13 @@ def correct(
                     miss = fix_velocity[r, i, a] - mean[r, i, a, 1]
                     spread = packed[r, i, a, 4] + velocity_noise
                     usable = gate == 0.0 or miss * miss <= gate * gate * spread
+                if fixless_axis[a]:
+                    x, c = mean[r, i, a], packed[r, i, a]
+                    kalman.forget(x, c, error_memory[a], error_noise[a])
+                    height_fits = restart[r, i] or kalman.position_inside(
+                        x, c, fix_position[r, i, a], fix_sigma[r, i, a], position_noise, gate
+                    )
+                    usable = usable and height_fits
             verdict[r, i] = NO_FIX
             if has_fix[r, i]:
                 verdict[r, i] = REFUSED if not usable else BEGUN if restart[r, i] else USED
@@ -140,9 +149,8 @@ def correct(
             for a in range(3):
                 x, c, p, grid = mean[r, i, a], packed[r, i, a], density[r, i, a], grids[r, i, a]
                 place, speed, sigma = fix_position[r, i, a], fix_velocity[r, i, a], fix_sigma[r, i, a]
-                alone = not has_fix[r, i] and fixless_axis[a] and is_measured(place, sigma)
                 if fixless_axis[a]:
-                    kalman.forget(x, c, error_memory[a], error_noise[a])
+                    alone = not has_fix[r, i] and height_fits and is_measured(place, sigma)
                     if verdict[r, i] == BEGUN:
                         kalman.begin(x, c, place, speed, sigma, position_noise, velocity_noise, bias_variance)
                     elif alone or used:
@@ -156,7 +164,7 @@ def correct(
                     x[1], x[3] = speed, 0.0
                     c[4], c[6], c[9] = velocity_noise, 0.0, bias_variance
                     _lay(x, c, p, grid, place, sigma, degrees)
-                    astray[r, i, a], lag[r, i, a] = 0.0, 0.0
+                    astray[r, i, a, EVIDENCE], lag[r, i, a] = 0.0, 0.0
                     continue
                 # Widened only now: of what an outage adds, the first velocity after it takes much away again.
                 if used:
@@ -166,15 +174,13 @@ def correct(
                     prior = _widen(p, spare, grid, c[0])
                     weight = np.tanh(0.5 * lag[r, i, a])
                     lag[r, i, a] = 0.0
-                    astray[r, i, a] += _beyond(grid, off, sigma, degrees, weight)
-                    if astray[r, i, a] > -LOG_FLOOR:
+                    if _is_elsewhere(astray[r, i, a], grid, off, sigma, degrees, weight):
                         _lay(x, c, p, grid, place, sigma, degrees)
-                        astray[r, i, a] = 0.0
+                        outvoted = False
                         continue
-                    astray[r, i, a] = max(astray[r, i, a], 0.0)
                     _sharpen(p, spare, grid, off, sigma, degrees, weight)
                     _weigh(p, off - grid[CENTRE], grid[STEP], sigma, degrees, weight)
-                    _settle(x, c, p, grid, prior)
+                    astray[r, i, a, PLACE] -= _settle(x, c, p, grid, prior)
                     _fit_grid(p, spare, grid, c[0])
             if outvoted:
                 verdict[r, i] = OUTVOTED
@@ -192,13 +198,25 @@ def _lay(x: Array, c: Array, p: Array, grid: Array, place: float, sigma: float, 
 
 
 @compiled_bare
-def _beyond(grid: Array, miss: float, sigma: float, degrees: float, weight: float) -> float:
-    """What a fix ``miss`` from the estimate says for a place far beyond the grid, as log of likelihoods."""
-    z = abs(miss) / sigma
-    far = abs(miss - grid[CENTRE]) > NODES // 2 * grid[STEP] and z > FAR
-    z = min(z, 1e6) if far else FAR
-    evidence = 0.5 * weight * (degrees + 1.0) * np.log1p(z * z / degrees)
-    return float(evidence if far else -evidence)
+def _is_elsewhere(
+    astray: Array, grid: Array, off: float, sigma: float, degrees: float, weight: float
+) -> bool:
+    """Whether fixes have told of one place beyond the grid for long enough; this one is ``off`` the estimate.
+
+    The evidence is the logarithm of the likelihoods' ratio, there to here, from the first fix that told of
+    it; never below none, and half of what it takes at most from one fix: it takes two that agree.
+    """
+    power, most = 0.5 * weight * (degrees + 1.0), -0.5 * LOG_FLOOR
+    here = np.log1p(min((off / sigma) ** 2, 1e12) / degrees)
+    if astray[EVIDENCE] > 0.0:
+        there = np.log1p(min(((off - astray[PLACE]) / sigma) ** 2, 1e12) / degrees)
+        astray[EVIDENCE] = max(astray[EVIDENCE] + min(power * (here - there), most), 0.0)
+    elif abs(off - grid[CENTRE]) > NODES // 2 * grid[STEP] and abs(off) > FAR * sigma:
+        astray[EVIDENCE], astray[PLACE] = min(power * here, most), off
+    if astray[EVIDENCE] <= -LOG_FLOOR:
+        return False
+    astray[EVIDENCE] = 0.0
+    return True
 
 
 @compiled_bare
@@ -292,8 +310,8 @@ def _widen(p: Array, spare: Array, grid: Array, variance: float) -> float:
 
 
 @compiled_bare
-def _settle(x: Array, c: Array, p: Array, grid: Array, prior: float) -> None:
-    """Take over the density's mean and variance.
+def _settle(x: Array, c: Array, p: Array, grid: Array, prior: float) -> float:
+    """Take over the density's mean and variance; returns how far the estimate moved [m].
 
     Velocity and bias do not follow the position: which of two places it is says nothing about them. They only
     have less in common with what is left of its error.
@@ -306,6 +324,7 @@ def _settle(x: Array, c: Array, p: Array, grid: Array, prior: float) -> None:
     c[3] *= left
     x[0] += moved
     grid[CENTRE] -= moved
+    return float(moved)
 
 
 @compiled_bare

@@ -61,14 +61,15 @@ class PointMassFilter:
         self._packed = np.full((*shape, kalman.PACKED), np.nan)
         self._density = np.full((*shape, point_mass.NODES), 1.0 / point_mass.NODES)
         self._grids = np.ones((*shape, 2))
-        self._astray = np.zeros(shape)
+        self._astray = np.zeros((*shape, 2))
         self._lag = np.zeros(shape)
         self._verdict = np.zeros((runs, uavs), dtype=np.int8)
         self._begun, self._used = (np.zeros((runs, uavs), dtype=np.bool_) for _ in range(2))
         self._refused_s = np.zeros((runs, uavs))
         self._refused_fixes, self._missed_fixes = (np.zeros((runs, uavs), dtype=np.int64) for _ in range(2))
         self._sigma = np.full(shape, np.nan)
-        self._age, self._epochs_since_new, self._epochs_per_new = 0, 1, 1
+        self._age, self._epochs_since_new, self._epochs_per_new = 0, 0, 1
+        self._first = True
         self._forecast = replace(
             model.forecast(), error_memory=np.where(model.fixless_axis, model.error_memory, 0.0)
         )
@@ -106,8 +107,8 @@ class PointMassFilter:
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(np.einsum("...ii->...i", covariance))
         sigma = np.where(is_symmetric(covariance)[..., None], sigma, np.nan)
-        first = not self._begun.any()
-        has_fix = (available | first) & (new | first)
+        has_fix = np.ones_like(available) if self._first else available & new
+        self._first = False
         self._missed_fixes += new & ~available & active[:, None]
         change = self._change()
         begins = ~self._begun | (self._refused_s >= GATE_PATIENCE_S - 1e-9)
@@ -162,8 +163,10 @@ class PointMassFilter:
         Where the error is one of the place, as a reflection's, it stays while a UAV stands.
         """
         model = self._model
-        speed = np.linalg.norm(self._mean[..., 1], axis=-1)
-        by_place = model.error_rate_standing_hz + model.error_rate_per_m * np.nan_to_num(speed, nan=0.0)
+        # Less what the estimate's own error adds on average: who stands must not seem to move.
+        squared = (self._mean[..., 1] ** 2 - self._packed[..., 4]).sum(axis=-1)
+        speed = np.sqrt(np.fmax(squared, 0.0))
+        by_place = model.error_rate_standing_hz + model.error_rate_per_m * speed
         rate = np.minimum(model.error_rate_hz, by_place[..., None])
         return np.asarray(model.period_s * model.ticks_per_epoch * rate)
 

@@ -14,7 +14,7 @@ class _NavigationBase(Section):
     rate_hz: float = Field(10.0, ge=0.1, le=100.0)
     """Rate of position fixes; each error is held between."""
     filter: Literal["none", "kalman", "point_mass"] = "none"
-    """Navigation filter between the fixes and the planner: none, for errors whose law is known, or for errors with heavy tails (docs/navigation.md)."""  # noqa: E501
+    """Navigation filter between the fixes and the planner: ``kalman`` for errors whose law is known, ``point_mass`` for errors with heavy tails (docs/navigation.md)."""  # noqa: E501
     common_mode_share: float = Field(0.0, ge=0.0, le=1.0)
     """Share of the error variance that all UAVs have in common."""
     reported_sigma_scale: float = Field(1.0, ge=1e-3, le=1e3)
@@ -35,7 +35,7 @@ class _NavigationBase(Section):
     """Filter: whether its normalised innovations are watched, reported sigmas that are too small scaled, and fixes that contradict the estimate held out while the UAV holds (docs/integrity.md)."""  # noqa: E501
     filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
     """Filter: correlation time that it assumes of the fix's error; by default the error's own."""
-    student_degrees_of_freedom: float = Field(3.0, ge=1.0, le=1e6)
+    student_degrees_of_freedom: float = Field(3.0, ge=2.5, le=1e6)
     """Point-mass filter: degrees of freedom of the Student law that it assumes of the fix's error; fewer are heavier tails."""  # noqa: E501
     filter_coast_sigma_m: float = Field(10.0, ge=1e-3, le=1e4)
     """Filter: without a fix, the solution counts as available up to this sigma of an axis."""

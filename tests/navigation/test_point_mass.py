@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from napf_mpc.navigation.filter import FilterModel, KalmanFilter
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.solution import NavSolution
-from napf_mpc.problem import GaussMarkov, Gnss, Recorded
+from napf_mpc.problem import ConstantBias, GaussMarkov, Gnss, Recorded
 from napf_mpc.problem_file import load_problem
 
 Array = NDArray[np.float64]
@@ -151,6 +151,18 @@ def test_correlated_fixes_count_as_many_as_they_are_worth() -> None:
     assert sigma_of(nav) == pytest.approx(3.0 / math.sqrt(1.0 + 80.0 / 8.0), rel=0.02)
 
 
+def test_noise_of_the_velocity_is_no_motion() -> None:
+    """Default sensors, standing for 60 s: worth what errors of 60 s are, within a tenth in sigma."""
+    config = Gnss.model_validate({"kind": "gnss", "filter": "point_mass"})
+    uavs = 40
+    navigation = PointMassFilter(FilterModel.of_navigation(config, EPOCH_S, 1), 1e6, 1, uavs)
+    standing = Standing(navigation, uavs)
+    for n in range(601):
+        nav = standing.fed(0.0, 3.0, noise_mps=0.1 if n else 0.0)
+    sigma = np.sqrt(np.einsum("ruaa->rua", nav.covariance[..., :3, :3])).mean()
+    assert sigma == pytest.approx(3.0 / math.sqrt(1.0 + 60.0 / 120.0), rel=0.1)
+
+
 @pytest.mark.parametrize(("speed_mps", "time_s"), [(0.0, 60.0), (1.0, 2.754), (6.0, 2.0)])
 def test_a_receiver_that_stands_keeps_its_error(speed_mps: float, time_s: float) -> None:
     """Emulated ones: the error lasts 60 s, or 5 m of the way; two seconds at least. Speed is on each axis."""
@@ -233,11 +245,22 @@ def test_so_is_one_beyond_the_grid() -> None:
     assert nav.position[0, 0, 0] == pytest.approx(1000.0, abs=5.0)
 
 
-def test_one_of_ten_far_beyond_the_grid_takes_nobody_there() -> None:
-    standing = point_mass(0.0, **EXACT)
-    for n in range(300):
-        nav = standing.fed(1000.0 if n % 10 == 9 else 0.0)
-    assert abs(nav.position[0, 0, 0]) < 1.0
+@pytest.mark.parametrize("far_m", [60.0, 300.0, 1000.0])
+@pytest.mark.parametrize("every", [3, 4, 10])
+@pytest.mark.parametrize("alternating", [False, True])
+@pytest.mark.parametrize(("tau_s", "length"), [(0.0, 1), (2.0, 20)])
+def test_a_minority_far_off_takes_nobody_there(
+    far_m: float, every: int, alternating: bool, tau_s: float, length: int
+) -> None:
+    """One fix of three, four or ten, or one stretch of 2 s, at one place or at two by turns: nowhere else."""
+    standing, random = point_mass(tau_s), np.random.default_rng(9)
+    for n in range(60 * length):
+        turn, part = divmod(n // length, every)
+        sign = -1.0 if alternating and turn % 2 else 1.0
+        off = sign * far_m if part == every - 1 else 0.0
+        nav = standing.fed(off + random.normal(size=3), 3.0, noise_mps=0.1)
+        assert np.abs(nav.position).max() < 6.0 or n < 6 * length
+    assert np.abs(nav.position).max() < 3.0
 
 
 def test_sigma_grows_where_fixes_contradict() -> None:
@@ -310,13 +333,20 @@ def test_a_fix_that_is_no_measurement_is_refused(place: float, sigma: float, vel
     assert np.isfinite(nav.covariance).all()
 
 
-def test_a_huge_position_harms_nothing() -> None:
-    standing = point_mass(2.0)
-    for _ in range(30):
-        before = standing.fed(0.5, 3.0)
-    nav = standing.fed(1e300, 3.0)
-    np.testing.assert_allclose(nav.position, before.position, atol=0.1)
+@pytest.mark.parametrize("far_m", [1e3, 1e5, 1e300])
+@pytest.mark.parametrize(
+    ("tau_s", "degrees", "outage"), [(2.0, 3.0, 0), (0.0, 3.0, 0), (2.0, 3.0, 100), (0.0, 8.0, 0)]
+)
+def test_one_absurd_position_harms_nothing(far_m: float, tau_s: float, degrees: float, outage: int) -> None:
+    standing = point_mass(tau_s, degrees)
+    for _ in range(60):
+        standing.fed(0.5, 3.0)
+    for _ in range(outage):
+        standing.fed(0.0, 3.0, available=False)
+    nav = standing.fed(far_m, 3.0)
+    np.testing.assert_allclose(nav.position, 0.5, atol=1.0)
     assert np.isfinite(nav.covariance).all()
+    assert standing.filter.refused_fixes.item() == 1
 
 
 def test_a_covariance_that_is_not_symmetric_is_refused() -> None:
@@ -404,6 +434,32 @@ def test_a_barometers_axis_is_the_kalman_filters() -> None:
     assert ahead[0] == ahead[1]
 
 
+def test_a_barometer_that_leaps_is_refused_as_by_the_kalman_filter() -> None:
+    """With a fix, which goes with it, and without."""
+    config = Recorded.model_validate({"kind": "recorded", "file": "log.csv", "filter": "point_mass"})
+    known = FilterModel.of_navigation(config, EPOCH_S, 1)
+    both = [Standing(PointMassFilter(known, 3.0, 1, 1)), Standing(KalmanFilter(known, 1, 1))]
+    for standing in both:
+        for _ in range(30):
+            standing.fed(0.0, [3.0, 3.0, 1.0])
+        standing.fed([0.0, 0.0, 500.0], [3.0, 3.0, 1.0])
+        nav = standing.fed([0.0, 0.0, 500.0], [3.0, 3.0, 1.0], available=False)
+        assert abs(nav.position[0, 0, 2]) < 0.1
+        assert standing.filter.refused_fixes.item() == 1
+
+
+def test_a_velocity_refused_for_three_seconds_begins_the_barometers_axis_anew_too() -> None:
+    config = Recorded.model_validate({"kind": "recorded", "file": "log.csv", "filter": "point_mass"})
+    known = FilterModel.of_navigation(config, EPOCH_S, 1)
+    standing = Standing(PointMassFilter(known, 3.0, 1, 1))
+    for _ in range(20):
+        standing.fed(0.0, [3.0, 3.0, 1.0])
+    for _ in range(31):
+        nav = standing.fed([0.0, 0.0, 4.0], [3.0, 3.0, 1.0], velocity=20.0)
+    assert nav.position[0, 0, 2] == pytest.approx(4.0, abs=0.2)
+    assert nav.velocity[0, 0, 2] == pytest.approx(20.0, abs=0.1)
+
+
 # ------------------------------------------------------------------------------------- forecast
 
 
@@ -420,6 +476,14 @@ def test_the_forecast_comes_true() -> None:
     then = np.einsum("ruaa->rua", nav.covariance[..., :3, :3])
     assert then.mean() < 0.4 * now.mean()
     assert ahead.mean() == pytest.approx(then.mean(), rel=0.1)
+
+
+def test_the_first_fix_expects_the_next_at_the_next_epoch() -> None:
+    standing = point_mass(0.0, **EXACT)
+    first, second = standing.fed(0.0).forecast, standing.fed(0.0).forecast
+    assert first is not None
+    assert second is not None
+    assert (first.epochs_per_new, second.epochs_per_new) == (1, 1)
 
 
 def test_the_forecast_of_an_outage_comes_true() -> None:
@@ -445,6 +509,25 @@ def test_a_slow_receiver_is_expected_to_tell_as_much() -> None:
 
 
 # ------------------------------------------------------------------------------------- in a problem
+
+
+def test_constant_errors_are_measured_once() -> None:
+    config = ConstantBias.model_validate({"kind": "constant", "filter": "point_mass"} | EXACT)
+    standing = Standing(PointMassFilter(FilterModel.of_navigation(config, EPOCH_S, 1), 3.0, 1, 1))
+    first = standing.fed(2.0)
+    for _ in range(100):
+        nav = standing.fed(-2.0)
+    np.testing.assert_allclose(nav.position, 2.0, atol=0.01)
+    assert sigma_of(nav) == pytest.approx(sigma_of(first), rel=0.01)
+
+
+def test_what_uavs_have_in_common_is_not_told() -> None:
+    """Their relative covariance is then the sum: larger than it is, never smaller."""
+    flown = load_problem("study_8s", {"navigation.filter": "point_mass", "navigation.common_mode_share": 0.5})
+    navigation = PointMassFilter(FilterModel.of_navigation(flown.navigation, EPOCH_S, 1), 3.0, 1, 2)
+    nav = Standing(navigation, 2).fed(0.0)
+    own = nav.position_covariance
+    np.testing.assert_array_equal(nav.relative_covariance(0, 1), own[:, 0] + own[:, 1])
 
 
 def test_it_has_no_monitor() -> None:
