@@ -9,19 +9,14 @@ has an interval.
 """
 
 import argparse
-from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.closed_loop import build_scenario, formation_mission
-from napf_mpc.formation import PathFrame, formation_offsets
-from napf_mpc.navigation.filtered import FilteredNavigation
-from napf_mpc.navigation.gnss_fixes import GnssErrors
+from napf_mpc.lanes import LaneNavigation, navigate
 from napf_mpc.plot.style import BLUE, VERMILION, house_style
-from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.risk import wilson
 
@@ -34,44 +29,7 @@ FILTERS = {
 }
 
 
-@dataclass(frozen=True)
-class Told:
-    """What a filter told, a moment a second."""
-
-    error: Array
-    """(t, run, uav, 3)"""
-    covariance: Array
-    """(t, run, uav, 3, 3)"""
-    refused: NDArray[np.int64]
-    """(run,)"""
-
-
-def flown(problem: Problem, errors: GnssErrors, seed: int, runs: int, stand_m: float | None) -> Told:
-    """All UAVs along their lanes, or standing in their slots for a minute, so far along."""
-    mission = formation_mission(problem)
-    frame, offsets = PathFrame.of_mission(mission), formation_offsets(problem.formation)
-    tick_s = 1.0 / problem.simulation.controller_rate_hz
-    ticks_per_fix = round(problem.simulation.controller_rate_hz / problem.navigation.rate_hz)
-    along = frame.to_world(np.array([[1.0, 0.0, 0.0]])) - frame.to_world(np.zeros((1, 3)))
-    pace = mission.speed_mps if stand_m is None else 0.0
-    seconds = 60.0 if stand_m is not None else mission.length_m / mission.speed_mps
-    speed = np.broadcast_to(pace * along, (runs, len(offsets), 3))
-    still, active = np.zeros(speed.shape), np.ones(runs, dtype=bool)
-    navigation = FilteredNavigation(
-        problem.navigation, errors, seed, range(runs), tick_s, ticks_per_fix, speed
-    )
-    error, covariance = [], []
-    for tick in range(int(seconds / tick_s)):
-        slots = offsets + np.array([(stand_m or 0.0) + pace * tick * tick_s, 0.0, 0.0])
-        position = np.repeat(frame.to_world(slots)[None], runs, axis=0)
-        told = navigation.solution(tick, tick * tick_s, position, speed, still, still, active)
-        if tick % round(1.0 / tick_s) == 0:
-            error.append(told.position - position)
-            covariance.append(told.position_covariance.copy())
-    return Told(np.array(error), np.array(covariance), navigation.gated_fixes)
-
-
-def row(label: str, told: Told) -> str:
+def row(label: str, told: LaneNavigation) -> str:
     """One line of the table."""
     e, c = told.error, told.covariance
     across, up = np.hypot(e[..., 0], e[..., 1]), np.abs(e[..., 2])
@@ -87,11 +45,11 @@ def row(label: str, told: Told) -> str:
         f"| {label} | {quantiles} | {np.quantile(up, 0.95):.1f} / {np.quantile(up, 0.999):.1f} "
         f"| {np.median(drms):.1f} | {nees.mean():.2f} | {100 * (np.abs(e) < 3.0 * sigma).mean():.2f} % "
         f"| {100 * lost.value:.0f} [{100 * lost.low:.0f}, {100 * lost.high:.0f}] % "
-        f"| {told.refused.mean():.0f} |"
+        f"| {told.gated_fixes.mean():.0f} |"
     )
 
 
-def figure(tolds: dict[str, Told], path: Path) -> None:
+def figure(tolds: dict[str, LaneNavigation], path: Path) -> None:
     """Save the error of the UAV that the Kalman filter lost farthest, and the tails of all."""
     far = np.abs(tolds["kalman"].error[..., 0])
     lost = np.unravel_index(far.max(axis=0).argmax(), far.shape[1:])
@@ -100,13 +58,12 @@ def figure(tolds: dict[str, Told], path: Path) -> None:
         for name, label, colour in (("kalman", "Kalman", VERMILION), ("point_mass", "point-mass", BLUE)):
             told = tolds[name]
             error, band = told.error[:, *lost, 0], 3.0 * np.sqrt(told.covariance[:, *lost, 0, 0])
-            seconds = np.arange(len(error))
-            left.plot(seconds, error, color=colour, label=label)
-            left.fill_between(seconds, -band, band, color=colour, alpha=0.15, linewidth=0.0)
+            left.plot(told.time_s, error, color=colour, label=label)
+            left.fill_between(told.time_s, -band, band, color=colour, alpha=0.15, linewidth=0.0)
             across = np.sort(np.hypot(told.error[..., 0], told.error[..., 1]).ravel())
             beyond = 1.0 - np.arange(len(across)) / len(across)
             right.semilogy(across, beyond, color=colour, label=label)
-        left.set(xlabel="time (s)", ylabel="error east (m)", xlim=(0.0, seconds[-1]))
+        left.set(xlabel="time (s)", ylabel="error east (m)", xlim=(0.0, told.time_s[-1]))
         left.set_title("one UAV, and 3 sigma as reported by either")
         right.set(xlabel="horizontal error (m)", ylabel="share beyond", xlim=(0.0, None), ylim=(1e-4, 1.0))
         right.set_title("all UAVs")
@@ -131,13 +88,13 @@ def main() -> None:
         "| within 3 sigma, axes | runs with a UAV 2 m beyond 3 sigma | fixes a run refused or outvoted |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    tolds: dict[str, Told] = {}
+    tolds: dict[str, LaneNavigation] = {}
     for label, settings in FILTERS.items():
         overrides = [f"{key}={value}" for key, value in settings.items()]
         problem = load_problem(options.problem, [*options.set, *overrides])
-        errors = build_scenario(problem, options.seed, range(options.runs), options.data).errors
-        assert isinstance(errors, GnssErrors)
-        tolds[label] = flown(problem, errors, options.seed, options.runs, options.stand)
+        tolds[label] = navigate(
+            problem, options.seed, range(options.runs), stand_m=options.stand, data_folder=options.data
+        )
         print(row(label, tolds[label]), flush=True)
     if options.figure:
         figure(tolds, options.figure)

@@ -31,7 +31,7 @@ from scipy.special import ndtr
 from napf_mpc import compare, load_problem
 from napf_mpc.closed_loop import build_scenario
 from napf_mpc.formation import PathFrame, formation_offsets
-from napf_mpc.navigation.filtered import FilteredNavigation
+from napf_mpc.lanes import navigate
 from napf_mpc.plot.sky import dop_map_figure, sigma_map_figure, sky_figure
 from napf_mpc.plot.style import BLUE, GREEN, GREY, VERMILION, house_style
 
@@ -147,38 +147,17 @@ print(
 # law for the fixes. Left, east of the UAV that the Kalman filter lost farthest; right, all of them.
 
 # %%
-fast = load_problem("street_canyon_gnss")
 few = max(4, RUNS // 15)
-pace, tick_s = fast.mission.speed_mps, 1.0 / fast.simulation.controller_rate_hz
-ticks_per_fix = round(fast.simulation.controller_rate_hz / fast.navigation.rate_hz)
-heading = frame.to_world(np.array([[1.0, 0.0, 0.0]])) - frame.to_world(np.zeros((1, 3)))
-still = np.zeros((few, len(slots), 3))
-estimates, reported = {}, {}
-for name in ("kalman", "point_mass"):
-    receivers = build_scenario(fast, 1, range(few)).errors
-    settings = fast.navigation.model_copy(update={"filter": name})
-    navigation = FilteredNavigation(
-        settings, receivers, 1, range(few), tick_s, ticks_per_fix, still + pace * heading
-    )
-    off, spread = [], []
-    for tick in range(int(fast.mission.length_m / pace / tick_s)):
-        where = frame.to_world(slots + np.array([pace * tick * tick_s, 0.0, 0.0]))
-        told = navigation.solution(
-            tick,
-            tick * tick_s,
-            np.repeat(where[None], few, axis=0),
-            still + pace * heading,
-            still,
-            still,
-            np.ones(few, dtype=bool),
-        )
-        if tick % 50 == 0:
-            off.append(told.position - where)
-            spread.append(np.sqrt(np.einsum("ruaa->rua", told.position_covariance)))
-    estimates[name], reported[name] = np.array(off), np.array(spread)
+told = {
+    name: navigate(load_problem("street_canyon_gnss", {"navigation.filter": name}), seed=1, runs=range(few))
+    for name in ("kalman", "point_mass")
+}
+estimates = {name: lanes.error for name, lanes in told.items()}
+reported = {name: np.sqrt(np.einsum("...aa->...a", lanes.covariance)) for name, lanes in told.items()}
+seconds = told["kalman"].time_s
 
-lost = np.unravel_index(np.abs(estimates["kalman"][..., 0]).max(axis=0).argmax(), still.shape[:2])
-seconds = np.arange(len(off)) * 50 * tick_s
+far = np.abs(estimates["kalman"][..., 0]).max(axis=0)
+lost = np.unravel_index(far.argmax(), far.shape)
 with house_style():
     figure, (left, right) = plt.subplots(1, 2, figsize=(7.2, 2.6), layout="constrained")
     for name, label, colour in (("kalman", "Kalman", VERMILION), ("point_mass", "point-mass", BLUE)):

@@ -25,7 +25,7 @@ FLOORS: list[set[str]] = [
     {"goal_walk"},
     {"block"},
     {"summary", "record", "provenance"},
-    {"evaluate"},
+    {"evaluate", "lanes"},
     {"closed_loop"},
     {"planners"},
     {"solvers"},
