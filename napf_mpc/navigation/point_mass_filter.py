@@ -80,8 +80,8 @@ class PointMassFilter:
     def refused_fixes(self) -> NDArray[np.int64]:
         """(run, uav) number of fixes so far that were refused, or outvoted.
 
-        Refused are unusable ones and those with a velocity beyond the gate; a position beyond the gate is
-        outvoted: it is used, and counts for little.
+        Refused are unusable ones and those with a velocity, or a barometer's height, beyond the gate; a
+        position beyond the gate is outvoted: it is used, and counts for little.
         """
         return self._refused_fixes.copy()
 
