@@ -75,6 +75,8 @@ def navigate(
     ------
     NapfError
         If the scene cannot be built or a data file is missing.
+    ValueError
+        If ``seconds`` is not above 0 and within ``simulation.time_limit_s``, or ``every_s`` not above 0.
     """
     mission = formation_mission(problem)
     frame, offsets = PathFrame.of_mission(mission), formation_offsets(problem.formation)
@@ -84,6 +86,12 @@ def navigate(
     pace, start = (mission.speed_mps, 0.0) if stand_m is None else (0.0, stand_m)
     if seconds is None:
         seconds = mission.length_m / mission.speed_mps if stand_m is None else 60.0
+    limit_s = problem.simulation.time_limit_s
+    if not (0.0 < seconds <= limit_s and every_s > 0.0):
+        raise ValueError(
+            f"seconds = {seconds:g}, every_s = {every_s:g}: need 0 < seconds <= simulation.time_limit_s = "
+            f"{limit_s:g}, as far as errors are drawn, and every_s > 0"
+        )
     ahead = frame.to_world(np.array([[1.0, 0.0, 0.0]])) - frame.to_world(np.zeros((1, 3)))
     velocity = np.broadcast_to(pace * ahead, (len(runs), len(offsets), 3))
     still, active = np.zeros(velocity.shape), np.ones(len(runs), dtype=np.bool_)

@@ -45,3 +45,12 @@ def test_emulated_receivers_are_asked_where_the_uavs_are() -> None:
     np.testing.assert_array_equal(moving.error[0], standing.error[0])
     change = [np.abs(np.diff(told.covariance[..., 0, 0], axis=0)).mean() for told in (moving, standing)]
     assert change[0] > 2.0 * change[1]
+
+
+@pytest.mark.parametrize(
+    "asked", [{"seconds": 0.0}, {"seconds": 111.0}, {"seconds": float("nan")}, {"every_s": 0.0}]
+)
+def test_it_says_what_it_cannot_do(asked: dict[str, float]) -> None:
+    problem = load_problem("study_8s", {"simulation.time_limit_s": 110.0})
+    with pytest.raises(ValueError, match=r"0 < seconds <= simulation\.time_limit_s = 110"):
+        navigate(problem, 1, range(1), **asked)  # type: ignore[arg-type]

@@ -291,7 +291,7 @@ class KalmanFilter:
         if not sound.all():
             sigma = np.where(sound[..., None], sigma, np.nan)
         begins = ~self._begun | self._gives_in()
-        first = not self._begun.any()
+        first = self._epoch == 0
         has_fix = (available | first) & (new | first)
         if self._monitor is not None:
             self._since_miss += 1

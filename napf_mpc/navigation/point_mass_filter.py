@@ -74,7 +74,6 @@ class PointMassFilter:
             model.forecast(), error_memory=np.where(model.fixless_axis, model.error_memory, 0.0)
         )
         self._law = (degrees + 3.0) / (degrees + 1.0)
-        self._noise = np.ones(shape)
 
     @property
     def refused_fixes(self) -> NDArray[np.int64]:
@@ -122,7 +121,7 @@ class PointMassFilter:
         self._epochs_since_new += 1
         if new:
             self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
-        self._noise = self._white_noise(change)
+        self._foresee(change)
         usable = np.isfinite(position) & np.isfinite(velocity) & np.isfinite(sigma) & (sigma > 0.0)
         self._note_verdict(available, np.asarray(usable.all(-1)), active[:, None])
 
@@ -154,7 +153,15 @@ class PointMassFilter:
             covariance=covariance,
             common_factor=np.zeros((runs, uavs, 3, 1)),
             filtered=True,
-            forecast=self._ahead(),
+            forecast=CovarianceForecast(
+                self._forecast,
+                self._packed.copy(),
+                self._sigma,
+                self._used,
+                self._age,
+                max(1, self._epochs_per_new - self._epochs_since_new),
+                self._epochs_per_new,
+            ),
         )
 
     def _change(self) -> Array:
@@ -170,26 +177,16 @@ class PointMassFilter:
         rate = np.minimum(model.error_rate_hz, by_place[..., None])
         return np.asarray(model.period_s * model.ticks_per_epoch * rate)
 
-    def _white_noise(self, change: Array) -> Array:
-        """(run, uav, 3) factor on a fix's variance that makes white noise of it, worth as much as it is here.
+    def _foresee(self, change: Array) -> None:
+        """Say how the variance goes on: as if the density were normal, at the speed of now.
 
-        A Student law has (nu + 1) / (nu + 3) of a normal one's information, and fixes count by weight.
+        To the forecast's filter a fix has white noise then, worth as much as it is here: a Student law has
+        (nu + 1) / (nu + 3) of a normal one's information, and fixes count by weight. Its variance is that of
+        the state g, in which this filter keeps nothing.
         """
         model = self._model
         with np.errstate(divide="ignore"):
-            factor = self._law / np.tanh(0.5 * self._epochs_per_new * change)
-        return np.where(model.fixless_axis, model.error_noise, np.minimum(factor, UNINFORMATIVE))
-
-    def _ahead(self) -> CovarianceForecast:
-        """How the variance goes on if the density is normal and the speed that of now."""
-        packed = self._packed.copy()
-        packed[..., 7] = np.where(self._model.fixless_axis, packed[..., 7], self._noise)
-        return CovarianceForecast(
-            replace(self._forecast, error_noise=self._noise),
-            packed,
-            self._sigma,
-            self._used,
-            self._age,
-            max(1, self._epochs_per_new - self._epochs_since_new),
-            self._epochs_per_new,
-        )
+            factor = np.minimum(self._law / np.tanh(0.5 * self._epochs_per_new * change), UNINFORMATIVE)
+        noise = np.where(model.fixless_axis, model.error_noise, factor)
+        self._packed[..., 7] = np.where(model.fixless_axis, self._packed[..., 7], noise)
+        self._forecast = replace(self._forecast, error_noise=noise)
