@@ -460,6 +460,25 @@ def test_a_velocity_refused_for_three_seconds_begins_the_barometers_axis_anew_to
     assert nav.velocity[0, 0, 2] == pytest.approx(20.0, abs=0.1)
 
 
+@pytest.mark.parametrize("robust", [False, True])
+def test_who_begins_does_not_depend_on_the_block(robust: bool) -> None:
+    """An unusable first fix, then none: the run waits for one, alone and beside another that has begun."""
+    known, told = model(2.0), []
+    for runs in (1, 2):
+        found = PointMassFilter(known, 3.0, runs, 1) if robust else KalmanFilter(known, runs, 1)
+        still, active = np.zeros((runs, 1, 3)), np.ones(runs, dtype=bool)
+        covariance = np.broadcast_to(9.0 * np.eye(3), (runs, 1, 3, 3))
+        for available in (True, False):
+            position = still.copy()
+            position[0] = np.nan if available else 1.0
+            has_fix = np.full((runs, 1), True)
+            has_fix[0] = available
+            found.correct(position, still, covariance, has_fix, True, active)
+            found.predict(still, active)
+        told.append(found.solution(0.1, still, still).position[0])
+    assert np.isnan(told).all()
+
+
 # ------------------------------------------------------------------------------------- forecast
 
 
