@@ -9,6 +9,7 @@ has an interval.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -49,6 +50,12 @@ def row(label: str, told: LaneNavigation) -> str:
     )
 
 
+def since(told: LaneNavigation, first_s: float) -> LaneNavigation:
+    """Return what was told from a time on."""
+    late = told.time_s >= first_s
+    return replace(told, time_s=told.time_s[late], error=told.error[late], covariance=told.covariance[late])
+
+
 def figure(tolds: dict[str, LaneNavigation], path: Path) -> None:
     """Save the error of the UAV that the Kalman filter lost farthest, and the tails of all."""
     far = np.abs(tolds["kalman"].error[..., 0])
@@ -80,6 +87,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=7200)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--stand", type=float, metavar="METRES", help="stand this far along for a minute")
+    parser.add_argument(
+        "--outage",
+        type=float,
+        nargs=2,
+        metavar=("FROM", "TO"),
+        help="no fix for so long [s]; told of it alone",
+    )
     parser.add_argument("--figure", type=Path, metavar="FILE", help="save errors over time and their tails")
     options = parser.parse_args()
     print(f"{options.problem}, N = {options.runs} runs, seed {options.seed} {' '.join(options.set)}")
@@ -93,8 +107,11 @@ def main() -> None:
         overrides = [f"{key}={value}" for key, value in settings.items()]
         problem = load_problem(options.problem, [*options.set, *overrides])
         tolds[label] = navigate(
-            problem, options.seed, range(options.runs), stand_m=options.stand, data_folder=options.data
-        )
+            problem, options.seed, range(options.runs), stand_m=options.stand, data_folder=options.data,
+            outage_s=options.outage, seconds=options.outage[1] if options.outage else None,
+        )  # fmt: skip
+        if options.outage:
+            tolds[label] = since(tolds[label], options.outage[0])
         print(row(label, tolds[label]), flush=True)
     if options.figure:
         figure(tolds, options.figure)

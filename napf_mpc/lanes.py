@@ -5,7 +5,7 @@ It tells filters and receivers apart without the planners that react to them, an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from napf_mpc.closed_loop import build_scenario, formation_mission
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.navigation.filtered import FilteredNavigation
-from napf_mpc.navigation.fix import fixes_of_flight
+from napf_mpc.navigation.fix import Fix, FixSource, fixes_of_flight
 from napf_mpc.problem import Problem
 from napf_mpc.streams import Seed
 
@@ -37,6 +37,18 @@ class LaneNavigation:
     """(run,) fixes refused or outvoted, of all UAVs; zeros without a filter."""
 
 
+class _Interrupted:
+    """Fixes of a flight, and none for a while."""
+
+    def __init__(self, fixes: FixSource, none: range) -> None:
+        self._fixes, self._none = fixes, none
+
+    def fix(self, epoch: int, position: Array) -> Fix:
+        """Fix of an epoch at true places, not available in the outage."""
+        found = self._fixes.fix(epoch, position)
+        return replace(found, available=np.zeros_like(found.available)) if epoch in self._none else found
+
+
 def navigate(
     problem: Problem,
     seed: Seed,
@@ -45,6 +57,7 @@ def navigate(
     stand_m: float | None = None,
     seconds: float | None = None,
     every_s: float = 1.0,
+    outage_s: tuple[float, float] | None = None,
     data_folder: Path | None = None,
 ) -> LaneNavigation:
     """Carry UAVs along their lanes at the reference speed, and keep what navigation tells.
@@ -63,6 +76,8 @@ def navigate(
         How long; by default what the path takes, or a minute for who stands [s].
     every_s : float
         Time between two moments that are kept, at least a tick of the inner loop [s].
+    outage_s : (float, float), optional
+        From when to when nobody has a fix [s].
     data_folder : path, optional
         Of real data.
 
@@ -96,10 +111,13 @@ def navigate(
     velocity = np.broadcast_to(pace * ahead, (len(runs), len(offsets), 3))
     still, active = np.zeros(velocity.shape), np.ones(len(runs), dtype=np.bool_)
     settings = problem.navigation
+    fixes: FixSource = fixes_of_flight(errors)
+    if outage_s is not None:
+        first, last = (round(moment / errors.period_s) for moment in outage_s)
+        fixes = _Interrupted(fixes, range(first, last))
     filtered = None
     if settings.filter != "none":
-        filtered = FilteredNavigation(settings, errors, seed, runs, tick_s, ticks_per_fix, velocity)
-    fixes = fixes_of_flight(errors)
+        filtered = FilteredNavigation(settings, errors, seed, runs, tick_s, ticks_per_fix, velocity, fixes)
     time, error, covariance = [], [], []
     kept_ticks = max(1, round(every_s / tick_s))
     for tick in range(round(seconds / tick_s)):

@@ -34,6 +34,9 @@ class Stream(IntEnum):
     GNSS_WAVES = 15
     GNSS_NOISE = 16
     GNSS_PHASES = 17
+    BAROMETER_WEATHER = 18
+    BAROMETER_DRIFT = 19
+    BAROMETER_NOISE = 20
 
 
 class Numbers(Protocol):

@@ -54,3 +54,20 @@ def test_it_says_what_it_cannot_do(asked: dict[str, float]) -> None:
     problem = load_problem("study_8s", {"simulation.time_limit_s": 110.0})
     with pytest.raises(ValueError, match=r"0 < seconds <= simulation\.time_limit_s = 110"):
         navigate(problem, 1, range(1), **asked)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["none", "kalman"])
+def test_an_outage_is_one_of_all_receivers_and_of_its_time(name: str) -> None:
+    """From 5 to 8 s nobody has a fix: the filter's sigmas grow until then and fall again."""
+    problem = load_problem("study_8s", {"navigation.filter": name})
+    told, whole = (
+        navigate(problem, 5, range(2), seconds=12.0, outage_s=outage) for outage in ((5.0, 8.0), None)
+    )
+    if name == "none":  # the errors' own report does not know of it
+        np.testing.assert_array_equal(told.error, whole.error)
+        return
+    np.testing.assert_array_equal(told.error[:5], whole.error[:5])
+    variance, usual = (np.einsum("t...aa->t...a", flown.covariance) for flown in (told, whole))
+    assert (variance[7] > usual[7]).all()
+    # Its last epoch lost, and the next taken.
+    assert (variance[8] < variance[7]).mean() > 0.9

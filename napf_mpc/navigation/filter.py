@@ -18,16 +18,17 @@ are two witnesses, and one of them may be right when the other is not.
 2. A fix that stands still to a millimetre while its velocity says that the UAV moves is refused.
 3. A fix that follows a refused one (the step between them is inside the gate) is refused as well, unless it
    is within :data:`~napf_mpc.navigation.kalman.PULL` sigmas of the estimate.
-4. After :data:`GATE_PATIENCE_S` of refused fixes, fixes and estimate are in dispute. The solution does not
-   count as available, so the UAV holds: that it does not move both stories say. What was known of the fix's
-   error is forgotten.
+4. After :data:`~napf_mpc.navigation.fix_record.GATE_PATIENCE_S` of refused fixes, fixes and estimate are in
+   dispute. The solution does not count as available, so the UAV holds: that it does not move both stories
+   say. What was known of the fix's error is forgotten.
 5. The dispute ends with a step that brings the fix inside the gate, or once fixes have been within
    :data:`CALM_SIGMAS` for :data:`CALM_S`. If the estimate's own sigma passes ``filter_coast_sigma_m`` first,
    or the dispute lasts longer than ``dispute_limit_s``, the filter begins anew with the fix, its sigma at
    least their distance.
 
 The axes are filtered apart. Where a fix reports a covariance between axes, that is not used to estimate, but
-carried through the gains that are, so the reported covariance has it.
+carried through the gains that are, so the reported covariance has it (but that of a height for which a
+barometer speaks).
 """
 
 from __future__ import annotations
@@ -38,15 +39,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.navigation import cross_covariance, kalman
+from napf_mpc.navigation import cross_covariance, height_offset, kalman
 from napf_mpc.navigation.fix import is_symmetric
+from napf_mpc.navigation.fix_record import GATE_PATIENCE_S, FixRecord
 from napf_mpc.navigation.forecast import CovarianceForecast, ForecastModel, drifts
 from napf_mpc.navigation.monitor import InnovationMonitor, squared_innovations
 from napf_mpc.navigation.sensors import bias_memory
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import ConstantBias, GaussMarkov, Gnss, Navigation, Recorded
 
-__all__ = ["GATE_PATIENCE_S", "RECEIVER_NOISE_M", "FilterModel", "KalmanFilter"]
+__all__ = ["RECEIVER_NOISE_M", "BarometerModel", "FilterModel", "KalmanFilter"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -57,13 +59,29 @@ RECEIVER_NOISE_M = 1e-3
 There is none in the simulated fixes. It covers the trapezoidal rule of the prediction (under 1 mm) and keeps
 the arithmetic sound where an error never changes, so that two fixes would tell the velocity exactly.
 """
-GATE_PATIENCE_S = 3.0
-"""Time of refused fixes without one used in between [s], after which the next starts the filter anew; with
-the monitor, after which they are in doubt."""
 CALM_S, CALM_SIGMAS = 30.0, 3.0
 """Doubted fixes that stay this near to the estimate, in sigmas of both, for this long [s] are used again."""
 REPEATED_SIGMAS = 5.0
 """A velocity beyond this many of its sigmas says that a UAV moves."""
+
+
+@dataclass(frozen=True)
+class BarometerModel:
+    """What the filter takes as known of barometers."""
+
+    noise: float
+    """Variance of the white noise [m^2]."""
+    offset: float
+    """Variance of an offset of which nothing is known [m^2]."""
+    drift: float
+    """Variance by which an offset wanders in a tick [m^2]."""
+
+    @classmethod
+    def of_receiver(cls, receiver: Gnss, period_s: float) -> BarometerModel:
+        """Take weather and sensor as one offset, that wanders as fast as both do at first."""
+        weather, own = receiver.barometer_weather_m**2, receiver.barometer_drift_m**2
+        rate = weather / receiver.barometer_weather_time_s + own / receiver.barometer_drift_time_s
+        return cls(receiver.barometer_noise_m**2, weather + own, 2.0 * rate * period_s)
 
 
 @dataclass(frozen=True)
@@ -106,6 +124,8 @@ class FilterModel:
     """Largest sigma of an axis with which a solution without a fix counts as available [m]."""
     monitored: bool = False
     """Whether innovations are watched, and sigmas that are too small scaled."""
+    barometer: BarometerModel | None = None
+    """Of barometers whose offset is to be learnt; None for no such sensor."""
     dispute_limit_s: float = math.inf
     """Watched: how long fixes and estimate may be in dispute before it begins anew with the fix [s]."""
 
@@ -152,6 +172,11 @@ class FilterModel:
             gate=navigation.innovation_gate_sigma,
             coast_sigma_m=navigation.filter_coast_sigma_m,
             monitored=navigation.monitor == "innovations",
+            barometer=(
+                BarometerModel.of_receiver(navigation, period_s)
+                if isinstance(navigation, Gnss) and navigation.barometer
+                else None
+            ),
             dispute_limit_s=math.inf if navigation.dispute_limit_s is None else navigation.dispute_limit_s,
         )
 
@@ -180,7 +205,8 @@ class KalmanFilter:
 
     Each begins with the first fix that it is given, at t = 0 also with one that is carried on from before:
     position = fix, with the reported sigma; velocity = GNSS velocity; bias zero, with its sigma. After
-    :data:`GATE_PATIENCE_S` of fixes that the gate refused it does so again, but for the monitor's rules.
+    :data:`~napf_mpc.navigation.fix_record.GATE_PATIENCE_S` of fixes that the gate refused it does so again,
+    but for the monitor's rules.
 
     Parameters
     ----------
@@ -194,15 +220,10 @@ class KalmanFilter:
         self._model = model
         self._mean = np.full((runs, uavs, 3, kalman.STATES), np.nan)
         self._packed = np.full((runs, uavs, 3, kalman.PACKED), np.nan)
-        self._begun = np.zeros((runs, uavs), dtype=np.bool_)
-        self._used = np.zeros((runs, uavs), dtype=np.bool_)
-        self._refused_s = np.zeros((runs, uavs))
-        self._refused_fixes = np.zeros((runs, uavs), dtype=np.int64)
-        self._missed_fixes = np.zeros((runs, uavs), dtype=np.int64)
+        self._record = FixRecord(runs, uavs, model.period_s * model.ticks_per_epoch)
         self._verdict = np.zeros((runs, uavs), dtype=np.int8)
         self._forecast = model.forecast()
         self._sigma = np.full((runs, uavs, 3), np.nan)
-        self._epochs_since_new, self._epochs_per_new = 0, 1
         self._monitor = InnovationMonitor(runs, uavs) if model.monitored else None
         self._doubted = np.zeros((runs, uavs), dtype=np.bool_)
         self._refused_miss = np.full((runs, uavs, 3), np.nan)
@@ -212,6 +233,7 @@ class KalmanFilter:
         self._barred = np.zeros((runs, uavs), dtype=np.bool_)
         self._last_position = np.full((runs, uavs, 3), np.nan)
         self._epoch = 0
+        self._offset = np.empty((runs if model.barometer else 0, uavs, height_offset.NUMBERS))
 
         shared = bool(model.common_share.any()) and 1 < uavs <= cross_covariance.MAX_UAVS
         kept = runs if shared or model.coupled else 0
@@ -229,12 +251,12 @@ class KalmanFilter:
     @property
     def refused_fixes(self) -> NDArray[np.int64]:
         """(run, uav) number of fixes refused so far, by the gate or as unusable."""
-        return self._refused_fixes.copy()
+        return self._record.refused.copy()
 
     @property
     def missed_fixes(self) -> NDArray[np.int64]:
         """(run, uav) number of epochs so far at which a fix was due and none came."""
-        return self._missed_fixes.copy()
+        return self._record.missed.copy()
 
     @property
     def monitor(self) -> InnovationMonitor | None:
@@ -262,7 +284,28 @@ class KalmanFilter:
             model.bias_noise,
             active,
         )
+        if model.barometer is not None:
+            height_offset.carry(
+                self._offset, model.period_s, model.bias_memory, model.barometer.drift, active
+            )
         self._age += 1
+
+    def take_in_heights(self, height: Array, active: Mask) -> None:
+        """Take in heights of barometers, with a fix or without; before the fix of the same epoch.
+
+        Parameters
+        ----------
+        height : array, shape (run, uav)
+            Measured, with the barometer's offset [m]; one that is not finite is none.
+        active : array of bool, shape (run,)
+            Runs that fly.
+        """
+        model = self._model
+        assert model.barometer is not None
+        height_offset.take_in_heights(
+            self._mean, self._packed, self._offset, height, model.barometer.noise, model.barometer.offset,
+            model.gate, self._record.begun, active,
+        )  # fmt: skip
 
     def correct(
         self, position: Array, velocity: Array, covariance: Array, available: Mask, new: bool, active: Mask
@@ -290,7 +333,7 @@ class KalmanFilter:
         sound = is_symmetric(covariance)
         if not sound.all():
             sigma = np.where(sound[..., None], sigma, np.nan)
-        begins = ~self._begun | self._gives_in()
+        begins = ~self._record.begun | self._gives_in()
         first = self._epoch == 0
         has_fix = (available | first) & (new | first)
         if self._monitor is not None:
@@ -298,7 +341,6 @@ class KalmanFilter:
             self._bar_repeated(position, velocity)
             sigma, covariance = self._watched(position, sigma, covariance, has_fix, begins, active)
         self._epoch += 1
-        self._missed_fixes += new & ~available & active[:, None]
         self._carried[...] = self._since[-1]
         kalman.correct(
             self._mean,
@@ -323,14 +365,17 @@ class KalmanFilter:
             self._verdict,
             self._carried,
             self._response,
+            self._offset,
+            math.nan if model.barometer is None else model.barometer.offset,
         )
+        if model.barometer is not None:
+            # What heights change is not carried: it is told that height and plan have nothing in common.
+            self._carried[:, :, height_offset.VERTICAL] = 0.0
+            self._response[:, :, height_offset.VERTICAL] = 0.0
         self._age = 0
         self._sigma = sigma
-        self._epochs_since_new += 1
-        if new:
-            self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
         usable = np.isfinite(position) & np.isfinite(velocity) & np.isfinite(sigma) & (sigma > 0.0)
-        self._note_verdict(available, np.asarray(usable.all(-1)), active)
+        self._record.note(self._verdict, available, new, np.asarray(usable.all(-1)), active)
         if self._monitor is not None:
             self._note_doubts(position, usable, sigma, available)
         self._advance_covariances(covariance, sigma, active)
@@ -341,11 +386,11 @@ class KalmanFilter:
         Unwatched, after its patience. With the monitor when the dispute has lasted too long, or the estimate
         has become worth nothing.
         """
-        late = self._refused_s >= GATE_PATIENCE_S - 1e-9
+        late = self._record.out_of_patience()
         if self._monitor is None:
             return late
         worthless = ~(self._packed[..., 0].max(-1) <= self._model.coast_sigma_m**2)
-        too_long = self._refused_s >= GATE_PATIENCE_S + self._model.dispute_limit_s - 1e-9
+        too_long = self._record.refused_s >= GATE_PATIENCE_S + self._model.dispute_limit_s - 1e-9
         return np.asarray(late & (worthless | too_long))
 
     def _bar_repeated(self, position: Array, velocity: Array) -> None:
@@ -364,7 +409,7 @@ class KalmanFilter:
         monitor, model = self._monitor, self._model
         assert monitor is not None
         time_s = self._epoch * model.ticks_per_epoch * model.period_s
-        anew = has_fix & begins & self._begun & active[:, None]
+        anew = has_fix & begins & self._record.begun & active[:, None]
         if anew.any():
             with np.errstate(invalid="ignore", divide="ignore"):
                 apart = (position - self._mean[..., 0]) ** 2 / (sigma**2 * monitor.scale)
@@ -383,24 +428,13 @@ class KalmanFilter:
         change = monitor.observe(squared, time_s)
         if (change != 1.0).any():
             kalman.rescale(self._mean, self._packed, change)
+            if len(self._offset):
+                grown = np.maximum(np.sqrt(change[..., height_offset.VERTICAL]), 1.0)
+                self._offset[..., height_offset.OP] *= grown
         if (monitor.scale == 1.0).all():
             return sigma, covariance
         root = np.sqrt(monitor.scale)
         return sigma * root, covariance * root[..., :, None] * root[..., None, :]
-
-    def _note_verdict(self, available: Mask, usable: Mask, active: Mask) -> None:
-        verdict = self._verdict
-        flying = active[:, None]
-        begun = (verdict == kalman.BEGUN) & flying
-        used = ((verdict == kalman.USED) & flying) | begun
-        refused = (verdict == kalman.REFUSED) & flying
-        self._begun |= begun
-        self._refused_fixes += refused
-        self._used = (self._used | used) & ~refused & available
-        # A fix that is no measurement says nothing against the estimate: patience is for those that disagree.
-        waiting = available & usable & ~self._used & flying
-        epoch_s = self._model.period_s * self._model.ticks_per_epoch
-        self._refused_s = np.where(self._used, 0.0, self._refused_s + epoch_s * waiting)
 
     def _note_doubts(self, position: Array, usable: Mask, sigma: Array, available: Mask) -> None:
         """Say whose fixes have been refused for long, and keep what the last was off if it was refused.
@@ -413,7 +447,7 @@ class KalmanFilter:
         miss = np.where(refused, position - self._mean[..., 0], np.nan)
         self._refused_miss = np.where(fresh[..., None], miss, self._refused_miss)
         self._since_miss[fresh] = 0
-        self._doubted = self._begun & (self._refused_s >= GATE_PATIENCE_S - 1e-9)
+        self._doubted = self._record.begun & self._record.out_of_patience()
         spread = CALM_SIGMAS**2 * (self._packed[..., 0] + sigma**2)
         near = (self._refused_miss**2 <= spread).all(-1) & available
         epoch_s = self._model.ticks_per_epoch * self._model.period_s
@@ -451,7 +485,7 @@ class KalmanFilter:
             Available with a fix in use, and without one while every axis' sigma is at most
             ``filter_coast_sigma_m``. The common factor is that of the last epoch of fixes.
         """
-        runs, uavs = self._begun.shape
+        runs, uavs = self._verdict.shape
         position, velocity = np.empty((runs, uavs, 3)), np.empty((runs, uavs, 3))
         covariance, widest = np.zeros((runs, uavs, 6, 6)), np.empty((runs, uavs))
         kalman.report(self._mean, self._packed, position, velocity, covariance, widest)
@@ -459,7 +493,7 @@ class KalmanFilter:
             cross_covariance.report_axes(self._cross, self._since[self._age], covariance)
         return NavSolution(
             time_s=time_s,
-            available=(self._used | (widest <= self._model.coast_sigma_m**2)) & ~self._doubted,
+            available=(self._record.used | (widest <= self._model.coast_sigma_m**2)) & ~self._doubted,
             position=position,
             velocity=velocity,
             attitude=attitude,
@@ -472,9 +506,9 @@ class KalmanFilter:
                 self._forecast,
                 self._packed.copy(),
                 self._sigma,
-                self._used,
+                self._record.used,
                 self._age,
-                max(1, self._epochs_per_new - self._epochs_since_new),
-                self._epochs_per_new,
+                self._record.epochs_to_new,
+                self._record.epochs_per_new,
             ),
         )

@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation.filter import FilterModel, KalmanFilter
-from napf_mpc.navigation.fix import PlacedErrors, PositionErrors, fixes_of_flight
+from napf_mpc.navigation.fix import FixSource, PlacedErrors, PositionErrors, fixes_of_flight
 from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.integrity.overbound import Overbound
 from napf_mpc.navigation.monitor import InnovationMonitor
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.replay import RecordedErrors
-from napf_mpc.navigation.sensors import Sensors
+from napf_mpc.navigation.sensors import Barometers, Sensors
 from napf_mpc.navigation.solution import NavSolution
-from napf_mpc.problem import Navigation
+from napf_mpc.problem import Gnss, Navigation
 from napf_mpc.streams import Seed
 
 __all__ = ["FilteredNavigation"]
@@ -52,6 +52,8 @@ class FilteredNavigation:
         Ticks from one epoch of fixes to the next.
     velocity : array, shape (run, uav, 3)
         True velocity at the start [m/s].
+    fixes : FixSource, optional
+        Fixes of this flight, instead of a new flight of the errors.
     """
 
     def __init__(
@@ -63,16 +65,20 @@ class FilteredNavigation:
         period_s: float,
         ticks_per_fix: int,
         velocity: Array,
+        fixes: FixSource | None = None,
     ) -> None:
         uavs = velocity.shape[1]
         self._errors = errors
-        self._fixes = fixes_of_flight(errors)
+        self._fixes = fixes_of_flight(errors) if fixes is None else fixes
         self._lasting: Array | None = None
         if isinstance(errors, GnssErrors):
             self._lasting = np.zeros((*velocity.shape[:2], 3, len(errors.scene.names)))
         self._ticks_per_fix = ticks_per_fix
         self._overbound: Overbound | None = None
         self._sensors = Sensors(navigation, seed, runs, uavs, period_s, velocity)
+        self._barometers: Barometers | None = None
+        if isinstance(navigation, Gnss) and navigation.barometer:
+            self._barometers = Barometers(navigation, seed, runs, uavs, period_s * ticks_per_fix)
         model = FilterModel.of_navigation(navigation, period_s, ticks_per_fix)
         self._filter: KalmanFilter | PointMassFilter
         if navigation.filter == "point_mass":
@@ -128,6 +134,8 @@ class FilteredNavigation:
             if self._lasting is not None:
                 self._lasting = np.where(fix.available[..., None, None], fix.common_factor, self._lasting)
                 covariance = covariance - _square(fix.common_factor)
+            if self._barometers is not None:
+                self._filter.take_in_heights(self._barometers.height(position[..., 2]), active)
             self._filter.correct(
                 position + fix.error,
                 self._sensors.gnss_velocity(velocity),

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled, compiled_bare
+from napf_mpc.navigation import height_offset
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,6 +28,8 @@ PACKED = 10
 
 NO_FIX, USED, BEGUN, REFUSED = 0, 1, 2, -1
 """What :func:`correct` made of a fix."""
+OUTVOTED = 3
+"""The point-mass filter's verdict on a fix that is used, but so far off that it counts for little."""
 PULL = 2.0
 """Distance in the estimate's own sigmas up to which a fix moves it no more than it claims to know."""
 
@@ -121,6 +124,8 @@ def correct(
     verdict: NDArray[np.int8],
     carried: Array,
     response: Array,
+    offset: Array,
+    offset_variance: float,
 ) -> None:
     """Take in one epoch of fixes, in place.
 
@@ -165,8 +170,13 @@ def correct(
         ``carried`` comes in as the transition of the estimation error since the last epoch and goes out as
         that to after this fix. ``response`` goes out as that error's answer to what is new in g at this
         epoch, in units of its sigma (at a beginning: to g as a whole). With no runs in them, neither is kept.
+    offset : array, shape (run, uav, 6)
+        Offsets of barometers, see :mod:`napf_mpc.navigation.height_offset`; overwritten. With no runs in it,
+        there is none.
+    offset_variance : float
+        Variance of an offset of which nothing is known [m^2].
     """
-    keep = carried.shape[0] > 0
+    keep, barometer = carried.shape[0] > 0, offset.shape[0] > 0
     full, k = np.empty((4, 4)), np.empty(4)
     for r in range(mean.shape[0]):
         if not active[r]:
@@ -180,6 +190,9 @@ def correct(
                 memory = 0.0 if doubted[r, i] else error_memory[a]
                 noise = 1.0 if doubted[r, i] else error_noise[a]
                 forget(x, c, memory, noise)
+                tied = barometer and a == height_offset.VERTICAL
+                if tied:
+                    offset[r, i, height_offset.OG] *= memory
                 if keep:
                     _forget_carried(carried[r, i, a], response[r, i, a], memory, noise)
                 if fresh:
@@ -201,8 +214,11 @@ def correct(
             for a in range(3):
                 x, c = mean[r, i, a], packed[r, i, a]
                 place, speed, sigma = fix_position[r, i, a], fix_velocity[r, i, a], fix_sigma[r, i, a]
+                tied = barometer and a == height_offset.VERTICAL
                 if verdict[r, i] == BEGUN:
                     begin(x, c, place, speed, sigma, position_noise, velocity_noise, bias_variance)
+                    if tied:
+                        height_offset.begin(offset[r, i], offset_variance)
                     if keep:
                         carried[r, i, a] = 0.0
                         response[r, i, a] = 0.0
@@ -215,11 +231,15 @@ def correct(
                     continue
                 unpack(c, full)
                 if not spoken:
-                    take_in(x, full, k, place, 1.0, 0.0, sigma, position_noise)
+                    spread, miss = take_in(x, full, k, place, 1.0, 0.0, sigma, position_noise)
+                    if tied:
+                        height_offset.learn(offset[r, i], k, 1.0, 0.0, sigma, spread, miss)
                     if keep:
                         _take_in_carried(carried[r, i, a], response[r, i, a], k, 1.0, 0.0, sigma)
                 if not alone:
-                    take_in(x, full, k, speed, 0.0, 1.0, 0.0, velocity_noise)
+                    spread, miss = take_in(x, full, k, speed, 0.0, 1.0, 0.0, velocity_noise)
+                    if tied:
+                        height_offset.learn(offset[r, i], k, 0.0, 1.0, 0.0, spread, miss)
                     if keep:
                         _take_in_carried(carried[r, i, a], response[r, i, a], k, 0.0, 1.0, 0.0)
                 pack(full, c)
@@ -337,8 +357,11 @@ def pack(full: Array, c: Array) -> None:
 @compiled_bare
 def take_in(
     x: Array, full: Array, k: Array, value: float, h_p: float, h_v: float, h_g: float, noise: float
-) -> None:
-    """Update with one scalar measurement of ``h_p p + h_v v + h_g g``; leaves the gain in ``k``."""
+) -> tuple[float, float]:
+    """Update with one scalar measurement of ``h_p p + h_v v + h_g g``; leaves the gain in ``k``.
+
+    Returns the variance that was expected of the measurement, and how far it was off.
+    """
     for n in range(4):
         k[n] = h_p * full[n, 0] + h_v * full[n, 1] + h_g * full[n, 2]
     spread = h_p * k[0] + h_v * k[1] + h_g * k[2] + noise
@@ -355,6 +378,7 @@ def take_in(
         seen = h_p * full[row, 0] + h_v * full[row, 1] + h_g * full[row, 2]
         for column in range(4):
             full[row, column] += k[column] * (noise * k[row] - seen)
+    return spread, miss
 
 
 @compiled_bare

@@ -22,18 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled, compiled_bare
-from napf_mpc.navigation import kalman
-from napf_mpc.navigation.kalman import BEGUN, NO_FIX, REFUSED, STATES, USED, is_measured
+from napf_mpc.navigation import height_offset, kalman
+from napf_mpc.navigation.kalman import BEGUN, NO_FIX, OUTVOTED, REFUSED, STATES, USED, is_measured
 
-__all__ = ["NODES", "OUTVOTED", "correct"]
+__all__ = ["NODES", "correct"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 NODES = 256
 """Nodes of an axis' grid."""
-OUTVOTED = 3
-"""Verdict on a fix that is used, but is beyond the gate of the estimate, so that it counts for little."""
 STEP, CENTRE = 0, 1
 """Numbers of a grid."""
 EVIDENCE, PLACE = 0, 1
@@ -76,6 +74,8 @@ def correct(
     restart: Mask,
     active: Mask,
     verdict: NDArray[np.int8],
+    offset: Array,
+    offset_variance: float,
 ) -> None:
     """Take in one epoch of fixes, in place.
 
@@ -119,8 +119,14 @@ def correct(
     active : array of bool, shape (run,)
         Runs that fly.
     verdict : array of int8, shape (run, uav)
-        Out: as in :func:`napf_mpc.navigation.kalman.correct`, or :data:`OUTVOTED`.
+        Out: as in :func:`napf_mpc.navigation.kalman.correct`, or ``OUTVOTED`` of that module.
+    offset : array, shape (run, uav, 6)
+        Offsets of barometers, see :mod:`napf_mpc.navigation.height_offset`; overwritten. With no runs in it,
+        there is none.
+    offset_variance : float
+        Variance of an offset of which nothing is known [m^2].
     """
+    barometer = offset.shape[0] > 0
     spare, full, gain = np.empty(NODES), np.empty((STATES, STATES)), np.empty(STATES)
     for r in range(mean.shape[0]):
         if not active[r]:
@@ -160,14 +166,22 @@ def correct(
                             kalman.take_in(x, full, gain, speed, 0.0, 1.0, 0.0, velocity_noise)
                         kalman.pack(full, c)
                     continue
+                tied = barometer and a == height_offset.VERTICAL
                 if verdict[r, i] == BEGUN:
                     x[1], x[3] = speed, 0.0
                     c[4], c[6], c[9] = velocity_noise, 0.0, bias_variance
                     _lay(x, c, p, grid, place, sigma, degrees)
+                    if tied:
+                        height_offset.begin(offset[r, i], offset_variance)
                     astray[r, i, a, EVIDENCE], lag[r, i, a] = 0.0, 0.0
                     continue
                 # Widened only now: of what an outage adds, the first velocity after it takes much away again.
                 if used:
+                    if tied:
+                        miss, expected = speed - x[1], c[4] + velocity_noise
+                        gain[0], gain[1] = c[1] / expected, c[4] / expected
+                        gain[2], gain[3] = 0.0, c[6] / expected
+                        height_offset.learn(offset[r, i], gain, 0.0, 1.0, 0.0, expected, miss)
                     _take_in_velocity(x, c, speed, velocity_noise)
                     off, spread = place - x[0], c[0] + sigma * sigma
                     outvoted = outvoted or (gate > 0.0 and off * off > gate * gate * spread)
@@ -176,11 +190,18 @@ def correct(
                     lag[r, i, a] = 0.0
                     if _is_elsewhere(astray[r, i, a], grid, off, sigma, degrees, weight):
                         _lay(x, c, p, grid, place, sigma, degrees)
+                        if tied:
+                            height_offset.begin(offset[r, i], offset_variance)
                         outvoted = False
                         continue
                     _sharpen(p, spare, grid, off, sigma, degrees, weight)
                     _weigh(p, off - grid[CENTRE], grid[STEP], sigma, degrees, weight)
-                    astray[r, i, a, PLACE] -= _settle(x, c, p, grid, prior)
+                    pv, pb = c[1], c[3]
+                    moved = _settle(x, c, p, grid, prior)
+                    if tied:
+                        left = min(c[0] / prior, 1.0)
+                        height_offset.follow(offset[r, i], pv, pb, prior, left, moved)
+                    astray[r, i, a, PLACE] -= moved
                     _fit_grid(p, spare, grid, c[0])
             if outvoted:
                 verdict[r, i] = OUTVOTED

@@ -16,14 +16,16 @@ Axes are filtered apart, and what UAVs have in common is not told: their relativ
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.navigation import kalman, point_mass
-from napf_mpc.navigation.filter import GATE_PATIENCE_S, RECEIVER_NOISE_M, FilterModel
+from napf_mpc.navigation import height_offset, kalman, point_mass
+from napf_mpc.navigation.filter import RECEIVER_NOISE_M, FilterModel
 from napf_mpc.navigation.fix import is_symmetric
+from napf_mpc.navigation.fix_record import FixRecord
 from napf_mpc.navigation.forecast import CovarianceForecast
 from napf_mpc.navigation.solution import NavSolution
 
@@ -41,8 +43,8 @@ class PointMassFilter:
 
     Each begins with the first fix that it is given, at t = 0 also with one that is carried on from before:
     density = the Student law about the fix; velocity = GNSS velocity; bias zero, with its sigma. After
-    :data:`~napf_mpc.navigation.filter.GATE_PATIENCE_S` of fixes whose velocity the gate refused it does so
-    again.
+    :data:`~napf_mpc.navigation.fix_record.GATE_PATIENCE_S` of fixes whose velocity the gate
+    refused it does so again.
 
     Parameters
     ----------
@@ -64,12 +66,11 @@ class PointMassFilter:
         self._astray = np.zeros((*shape, 2))
         self._lag = np.zeros(shape)
         self._verdict = np.zeros((runs, uavs), dtype=np.int8)
-        self._begun, self._used = (np.zeros((runs, uavs), dtype=np.bool_) for _ in range(2))
-        self._refused_s = np.zeros((runs, uavs))
-        self._refused_fixes, self._missed_fixes = (np.zeros((runs, uavs), dtype=np.int64) for _ in range(2))
+        self._record = FixRecord(runs, uavs, model.period_s * model.ticks_per_epoch)
         self._sigma = np.full(shape, np.nan)
-        self._age, self._epochs_since_new, self._epochs_per_new = 0, 0, 1
+        self._age = 0
         self._first = True
+        self._offset = np.empty((runs if model.barometer else 0, uavs, height_offset.NUMBERS))
         self._forecast = replace(
             model.forecast(), error_memory=np.where(model.fixless_axis, model.error_memory, 0.0)
         )
@@ -82,12 +83,12 @@ class PointMassFilter:
         Refused are unusable ones and those with a velocity, or a barometer's height, beyond the gate; a
         position beyond the gate is outvoted: it is used, and counts for little.
         """
-        return self._refused_fixes.copy()
+        return self._record.refused.copy()
 
     @property
     def missed_fixes(self) -> NDArray[np.int64]:
         """(run, uav) number of epochs so far at which a fix was due and none came."""
-        return self._missed_fixes.copy()
+        return self._record.missed.copy()
 
     def predict(self, velocity_change: Array, active: Mask) -> None:
         """Carry the estimates over a tick; parameters are those of the Kalman filter's."""
@@ -96,7 +97,20 @@ class PointMassFilter:
             self._mean, self._packed, velocity_change, model.period_s, model.bias_memory,
             model.velocity_change_noise, model.bias_noise, active,
         )  # fmt: skip
+        if model.barometer is not None:
+            height_offset.carry(
+                self._offset, model.period_s, model.bias_memory, model.barometer.drift, active
+            )
         self._age += 1
+
+    def take_in_heights(self, height: Array, active: Mask) -> None:
+        """Take in heights of barometers; parameters are those of the Kalman filter's."""
+        model = self._model
+        assert model.barometer is not None
+        height_offset.take_in_heights(
+            self._mean, self._packed, self._offset, height, model.barometer.noise, model.barometer.offset,
+            model.gate, self._record.begun, active,
+        )  # fmt: skip
 
     def correct(
         self, position: Array, velocity: Array, covariance: Array, available: Mask, new: bool, active: Mask
@@ -108,44 +122,29 @@ class PointMassFilter:
         sigma = np.where(is_symmetric(covariance)[..., None], sigma, np.nan)
         has_fix = np.ones_like(available) if self._first else available & new
         self._first = False
-        self._missed_fixes += new & ~available & active[:, None]
         change = self._change()
-        begins = ~self._begun | (self._refused_s >= GATE_PATIENCE_S - 1e-9)
+        begins = ~self._record.begun | self._record.out_of_patience()
         point_mass.correct(
             self._mean, self._packed, self._density, self._grids, self._astray, self._lag,
             position, velocity, sigma, has_fix, model.fixless_axis, model.error_memory, model.error_noise,
             change, self._degrees, RECEIVER_NOISE_M**2, model.velocity_sigma_mps**2, model.bias_sigma_mps2**2,
-            model.gate, begins, active, self._verdict,
+            model.gate, begins, active, self._verdict, self._offset,
+            math.nan if model.barometer is None else model.barometer.offset,
         )  # fmt: skip
         self._age, self._sigma = 0, sigma
-        self._epochs_since_new += 1
-        if new:
-            self._epochs_since_new, self._epochs_per_new = 0, max(1, self._epochs_since_new)
-        self._foresee(change)
         usable = np.isfinite(position) & np.isfinite(velocity) & np.isfinite(sigma) & (sigma > 0.0)
-        self._note_verdict(available, np.asarray(usable.all(-1)), active[:, None])
-
-    def _note_verdict(self, available: Mask, usable: Mask, flying: Mask) -> None:
-        verdict = self._verdict
-        begun, refused = (verdict == kalman.BEGUN) & flying, (verdict == kalman.REFUSED) & flying
-        outvoted = (verdict == point_mass.OUTVOTED) & flying
-        used = ((verdict == kalman.USED) & flying) | begun | outvoted
-        self._begun |= begun
-        self._refused_fixes += refused | outvoted
-        self._used = (self._used | used) & ~refused & available
-        waiting = available & usable & ~self._used & flying
-        epoch_s = self._model.period_s * self._model.ticks_per_epoch
-        self._refused_s = np.where(self._used, 0.0, self._refused_s + epoch_s * waiting)
+        self._record.note(self._verdict, available, new, np.asarray(usable.all(-1)), active)
+        self._foresee(change)
 
     def solution(self, time_s: float, attitude: Array, body_rates: Array) -> NavSolution:
         """Issue the solution of now; parameters and availability are those of the Kalman filter's."""
-        runs, uavs = self._begun.shape
+        runs, uavs = self._verdict.shape
         position, velocity = np.empty((runs, uavs, 3)), np.empty((runs, uavs, 3))
         covariance, widest = np.zeros((runs, uavs, 6, 6)), np.empty((runs, uavs))
         kalman.report(self._mean, self._packed, position, velocity, covariance, widest)
         return NavSolution(
             time_s=time_s,
-            available=self._used | (widest <= self._model.coast_sigma_m**2),
+            available=self._record.used | (widest <= self._model.coast_sigma_m**2),
             position=position,
             velocity=velocity,
             attitude=attitude,
@@ -157,10 +156,10 @@ class PointMassFilter:
                 self._forecast,
                 self._packed.copy(),
                 self._sigma,
-                self._used,
+                self._record.used,
                 self._age,
-                max(1, self._epochs_per_new - self._epochs_since_new),
-                self._epochs_per_new,
+                self._record.epochs_to_new,
+                self._record.epochs_per_new,
             ),
         )
 
@@ -186,7 +185,9 @@ class PointMassFilter:
         """
         model = self._model
         with np.errstate(divide="ignore"):
-            factor = np.minimum(self._law / np.tanh(0.5 * self._epochs_per_new * change), UNINFORMATIVE)
+            factor = np.minimum(
+                self._law / np.tanh(0.5 * self._record.epochs_per_new * change), UNINFORMATIVE
+            )
         noise = np.where(model.fixless_axis, model.error_noise, factor)
         self._packed[..., 7] = np.where(model.fixless_axis, self._packed[..., 7], noise)
         self._forecast = replace(self._forecast, error_noise=noise)

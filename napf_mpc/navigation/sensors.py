@@ -1,4 +1,4 @@
-"""Sensors beside the position fix, simulated from the truth: GNSS velocity and accelerometers."""
+"""Sensors beside the position fix, simulated from the truth: GNSS velocity, accelerometers, barometers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
-from napf_mpc.problem import Navigation
+from napf_mpc.problem import Gnss, Navigation
 from napf_mpc.streams import NormalSequence, Seed, Stream
 from napf_mpc.vehicle.plant import plain
 
-__all__ = ["Sensors", "bias_memory"]
+__all__ = ["Barometers", "Sensors", "bias_memory"]
 
 Array = NDArray[np.float64]
 
@@ -81,6 +81,71 @@ class Sensors:
             self._period_s, self._noise_sigma, self._memory, self._new_bias_sigma, measured,
         )  # fmt: skip
         return measured
+
+
+class Barometers:
+    r"""What the barometer of every UAV of every run says of its height.
+
+    .. math:: z = h + \sigma_w g_w(t) + \sigma_d g_{d,i}(t) + \sigma_n n,
+
+    :math:`g_w`, of all UAVs of a run, and :math:`g_{d,i}`, each one's own, Gauss-Markov processes of unit
+    variance, and white noise n. Heights carry ``error_scale``, as all errors do.
+
+    Parameters
+    ----------
+    receiver : Gnss
+        Sigmas and times.
+    seed : int or Numbers
+        Campaign seed, or what stands for it.
+    runs : range
+        Runs of the block.
+    uavs : int
+        Number of UAVs.
+    epoch_s : float
+        Time between two epochs [s].
+    """
+
+    def __init__(self, receiver: Gnss, seed: Seed, runs: range, uavs: int, epoch_s: float) -> None:
+        self._scale = receiver.error_scale
+        self._noise_m = receiver.barometer_noise_m
+        self._noise = NormalSequence(seed, runs, Stream.BAROMETER_NOISE, uavs, axes=1)
+        self._parts = [
+            _Wander(
+                NormalSequence(seed, runs, Stream.BAROMETER_WEATHER, 1, axes=1),
+                receiver.barometer_weather_m,
+                receiver.barometer_weather_time_s,
+                epoch_s,
+            ),
+            _Wander(
+                NormalSequence(seed, runs, Stream.BAROMETER_DRIFT, uavs, axes=1),
+                receiver.barometer_drift_m,
+                receiver.barometer_drift_time_s,
+                epoch_s,
+            ),
+        ]
+
+    def height(self, height: Array) -> Array:
+        """Measured heights (run, uav) of the next epoch, of true ones [m]."""
+        error = self._noise_m * self._noise.take()[..., 0]
+        for part in self._parts:
+            error = error + part.take()
+        return np.asarray(height + self._scale * error)
+
+
+class _Wander:
+    """A Gauss-Markov process of many series, epoch by epoch."""
+
+    def __init__(self, new: NormalSequence, sigma: float, time_s: float, epoch_s: float) -> None:
+        self._new, self._sigma = new, sigma
+        self._memory = math.exp(-epoch_s / time_s)
+        self._share = math.sqrt(-math.expm1(-2.0 * epoch_s / time_s))
+        self._now: Array | None = None
+
+    def take(self) -> Array:
+        """Values (run, series) of the next epoch."""
+        new = self._new.take()[..., 0]
+        self._now = new.copy() if self._now is None else self._memory * self._now + self._share * new
+        return self._sigma * self._now
 
 
 @compiled

@@ -189,6 +189,18 @@ class Gnss(_NavigationBase):
     """Protection levels: chance that a signal on the horizon is a reflection alone, before its C/N0 is known; it falls with the angle to 0 in the zenith."""  # noqa: E501
     p_satellite: float = Field(1e-5, ge=0.0, le=0.1)
     """Protection levels: chance that a satellite is faulty."""
+    barometer: bool = False
+    """Whether each UAV has a barometer too: the filter learns its offset from the receiver's heights, and keeps the height by it where no fix comes."""  # noqa: E501
+    barometer_weather_m: float = Field(8.0, ge=0.0, le=1e4)
+    """Barometer: sigma of the offset by the weather, the same for all UAVs (8 m are 1 hPa)."""
+    barometer_weather_time_s: float = Field(10_800.0, ge=1.0, le=1e7)
+    """Barometer: correlation time of that offset."""
+    barometer_drift_m: float = Field(1.0, ge=0.0, le=1e3)
+    """Barometer: sigma of each sensor's own offset."""
+    barometer_drift_time_s: float = Field(300.0, ge=1.0, le=1e7)
+    """Barometer: correlation time of that offset."""
+    barometer_noise_m: float = Field(0.1, ge=1e-3, le=100.0)
+    """Barometer: sigma of its white noise, at each epoch of fixes."""
     filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] = 2.0
     """Filter: correlation time that it assumes of the error but for what UAVs have in common, which lasts."""
     filter_correlation_length_m: float = Field(5.0, ge=0.1, le=1e4)
@@ -215,6 +227,11 @@ class Gnss(_NavigationBase):
             raise ValueError("common_mode_share must be left out: it follows from the satellites in common")
         if (self.origin_latitude_deg is None) != (self.origin_longitude_deg is None):
             raise ValueError("origin_latitude_deg and origin_longitude_deg go together: give both or none")
+        if self.barometer and self.filter == "none":
+            raise ValueError(
+                'barometer = true, but filter = "none": it takes one to learn its offset; set filter = '
+                '"point_mass" or "kalman", or leave the barometer out'
+            )
         if self.file is None and set(self.systems) == {"QZSS"}:
             raise ValueError("systems: QZSS is in files only; name one, or receive GPS or Galileo")
         return self

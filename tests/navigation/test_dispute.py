@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from napf_mpc.navigation.filter import CALM_S, GATE_PATIENCE_S, FilterModel, KalmanFilter
+from napf_mpc.navigation.filter import CALM_S, FilterModel, KalmanFilter
+from napf_mpc.navigation.fix_record import GATE_PATIENCE_S
 from napf_mpc.problem import GaussMarkov
 
 PERIOD_S = 0.1
