@@ -27,6 +27,7 @@ FILTERS = {
     "kalman": {"navigation.filter": "kalman"},
     "kalman, watched": {"navigation.filter": "kalman", "navigation.monitor": "innovations"},
     "point_mass": {"navigation.filter": "point_mass"},
+    "point_mass, watched": {"navigation.filter": "point_mass", "navigation.monitor": "innovations"},
 }
 
 

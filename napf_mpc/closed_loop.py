@@ -25,7 +25,7 @@ from napf_mpc.navigation.fix import Fix, FixSource, PlacedErrors, PositionErrors
 from napf_mpc.navigation.gnss import gnss_scene
 from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.gnss_sigma import sigma_map
-from napf_mpc.navigation.monitor import InnovationMonitor
+from napf_mpc.navigation.monitor import Monitor
 from napf_mpc.navigation.sigma_map import SigmaMap
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import MovingTracker
@@ -174,7 +174,7 @@ class Flight:
     the run's UAVs; None if it never did."""
     waited_s: Array | None = None
     """(run,) time in which some UAV was hovering on purpose [s]; None if none ever was."""
-    monitor: InnovationMonitor | None = None
+    monitor: Monitor | None = None
     """What watched the navigation filter's innovations; None if nothing did."""
 
 

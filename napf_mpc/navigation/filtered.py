@@ -19,7 +19,7 @@ from napf_mpc.navigation.filter import FilterModel, KalmanFilter
 from napf_mpc.navigation.fix import FixSource, PlacedErrors, PositionErrors, fixes_of_flight
 from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.integrity.overbound import Overbound
-from napf_mpc.navigation.monitor import InnovationMonitor
+from napf_mpc.navigation.monitor import Monitor
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.replay import RecordedErrors
 from napf_mpc.navigation.sensors import Barometers, Sensors
@@ -98,9 +98,9 @@ class FilteredNavigation:
         return np.asarray(self._filter.missed_fixes.sum(axis=-1), dtype=np.int64)
 
     @property
-    def monitor(self) -> InnovationMonitor | None:
+    def monitor(self) -> Monitor | None:
         """What watches the innovations; None if nothing does."""
-        return self._filter.monitor if isinstance(self._filter, KalmanFilter) else None
+        return self._filter.monitor
 
     def solution(
         self,
@@ -146,7 +146,11 @@ class FilteredNavigation:
             )
         found = self._filter.solution(time_s, attitude.copy(), body_rates.copy())
         if self._lasting is not None:
-            found = _with_lasting(found, self._lasting)
+            lasting = self._lasting
+            if self.monitor is not None:
+                # A receiver that believes too much of its own errors does so of what it shares with others.
+                lasting = lasting * np.sqrt(self.monitor.scale)[..., None]
+            found = _with_lasting(found, lasting)
         # A protection level is one of the fix, and says nothing of an estimate: it ends here.
         return found if self._overbound is None else replace(found, overbound=self._overbound)
 

@@ -31,6 +31,7 @@ __all__ = [
     "WINDOW",
     "DoubtEvent",
     "InnovationMonitor",
+    "Monitor",
     "MonitorEvent",
     "squared_innovations",
 ]
@@ -82,8 +83,8 @@ class MonitorEvent:
     """Factor on the reported sigma."""
 
 
-class InnovationMonitor:
-    """Windows and scales of all axes of all UAVs of a block of runs.
+class Monitor:
+    """What a monitor tells of all axes of all UAVs of a block of runs.
 
     Parameters
     ----------
@@ -92,12 +93,37 @@ class InnovationMonitor:
     """
 
     def __init__(self, runs: int, uavs: int) -> None:
-        shape = (runs, uavs, 3)
-        self.scale: Array = np.ones(shape)
+        self.scale: Array = np.ones((runs, uavs, 3))
+        """(run, uav, 3) factor on the variances that fixes report, at least 1."""
         self.alarms = np.zeros((runs, uavs), dtype=np.int64)
+        """(run, uav) number of alarms so far."""
         self.largest: Array = np.ones((runs, uavs))
+        """(run, uav) largest factor on a sigma so far."""
         self.events: list[MonitorEvent] = []
+        """Alarms one by one."""
         self.doubts: list[DoubtEvent] = []
+        """Disputes of fixes and estimate, of filters that have them."""
+
+    def _alarm(self, at: tuple[Any, ...], scale: float, time_s: float) -> None:
+        """Note that an axis has a new and larger factor on its variance."""
+        run, uav, axis = (int(i) for i in at)
+        self.alarms[run, uav] += 1
+        self.largest[run, uav] = max(self.largest[run, uav], scale**0.5)
+        self.events.append(MonitorEvent(time_s, run, uav, axis, scale**0.5))
+
+
+class InnovationMonitor(Monitor):
+    """Windows of innovations of all axes of all UAVs of a block of runs.
+
+    Parameters
+    ----------
+    runs, uavs : int
+        How many.
+    """
+
+    def __init__(self, runs: int, uavs: int) -> None:
+        super().__init__(runs, uavs)
+        shape = (runs, uavs, 3)
         self.doubted: Mask = np.zeros((runs, uavs), dtype=np.bool_)
         self._window = np.full((*shape, WINDOW), np.nan)
         self._count = np.zeros(shape, dtype=np.int64)
@@ -179,10 +205,7 @@ class InnovationMonitor:
         self._window[at] = np.nan
         self._count[at] = 0
         if alarm:
-            run, uav, axis = (int(i) for i in at)
-            self.alarms[run, uav] += 1
-            self.largest[run, uav] = max(self.largest[run, uav], scale**0.5)
-            self.events.append(MonitorEvent(time_s, run, uav, axis, scale**0.5))
+            self._alarm(at, scale, time_s)
 
 
 @compiled

@@ -27,6 +27,7 @@ from napf_mpc.navigation.filter import RECEIVER_NOISE_M, FilterModel
 from napf_mpc.navigation.fix import is_symmetric
 from napf_mpc.navigation.fix_record import FixRecord
 from napf_mpc.navigation.forecast import CovarianceForecast
+from napf_mpc.navigation.scale_evidence import ScaleEvidence
 from napf_mpc.navigation.solution import NavSolution
 
 __all__ = ["PointMassFilter"]
@@ -69,7 +70,11 @@ class PointMassFilter:
         self._record = FixRecord(runs, uavs, model.period_s * model.ticks_per_epoch)
         self._sigma = np.full(shape, np.nan)
         self._age = 0
-        self._first = True
+        self._epoch = 0
+        self.monitor: ScaleEvidence | None = None
+        """What watches the innovations; None if nothing does."""
+        if model.monitored:
+            self.monitor = ScaleEvidence(degrees, ~model.fixless_axis, runs, uavs)
         self._offset = np.empty((runs if model.barometer else 0, uavs, height_offset.NUMBERS))
         self._forecast = replace(
             model.forecast(), error_memory=np.where(model.fixless_axis, model.error_memory, 0.0)
@@ -120,10 +125,12 @@ class PointMassFilter:
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(np.einsum("...ii->...i", covariance))
         sigma = np.where(is_symmetric(covariance)[..., None], sigma, np.nan)
-        has_fix = np.ones_like(available) if self._first else available & new
-        self._first = False
+        has_fix = np.ones_like(available) if self._epoch == 0 else available & new
         change = self._change()
         begins = ~self._record.begun | self._record.out_of_patience()
+        if self.monitor is not None:
+            sigma = self._watched(position, sigma, change, has_fix & ~begins & active[:, None])
+        self._epoch += 1
         point_mass.correct(
             self._mean, self._packed, self._density, self._grids, self._astray, self._lag,
             position, velocity, sigma, has_fix, model.fixless_axis, model.error_memory, model.error_noise,
@@ -162,6 +169,23 @@ class PointMassFilter:
                 self._record.epochs_per_new,
             ),
         )
+
+    def _watched(self, position: Array, sigma: Array, change: Array, fresh: Mask) -> Array:
+        """Sigmas (run, uav, 3) as the monitor makes them believable."""
+        assert self.monitor is not None
+        off = np.where(fresh[..., None], position - self._mean[..., 0], np.nan)
+        weight = np.tanh(0.5 * (self._lag + change))
+        epoch_s = self._model.period_s * self._model.ticks_per_epoch
+        grown = self.monitor.observe(off, self._packed[..., 0], sigma, weight, self._epoch * epoch_s)
+        if (grown > 1.0).any():
+            # What was made of the fixes so far is as uncertain as they are; the density follows its variance.
+            root = np.sqrt(np.maximum(grown, 1.0))
+            self._packed[..., 0] *= root * root
+            self._packed[..., 1] *= root
+            self._packed[..., 3] *= root
+            if len(self._offset):
+                self._offset[..., height_offset.OP] *= root[..., height_offset.VERTICAL]
+        return np.asarray(sigma * np.sqrt(self.monitor.scale))
 
     def _change(self) -> Array:
         """(run, uav, 3) correlation times by which the fix's error changes in an epoch.

@@ -88,10 +88,10 @@ class Problem(Section):
     def _safety_faults(self) -> list[str]:
         """What is to drive the safety distance must be told by navigation."""
         navigation = self.navigation
-        if navigation.monitor != "none" and navigation.filter != "kalman":
+        if navigation.monitor != "none" and navigation.filter == "none":
             return [
-                f'navigation.monitor = "{navigation.monitor}" watches the Kalman filter\'s innovations, '
-                f'navigation.filter = "{navigation.filter}" has none: set filter = "kalman", or leave the '
+                f'navigation.monitor = "{navigation.monitor}" watches a filter\'s innovations, and '
+                'navigation.filter = "none" has none: set filter = "kalman" or "point_mass", or leave the '
                 "monitor out"
             ]
         if self.planner.covariance == "mapped" and not isinstance(navigation, Gnss):
