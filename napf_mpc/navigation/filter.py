@@ -174,7 +174,7 @@ class FilterModel:
             monitored=navigation.monitor == "innovations",
             barometer=(
                 BarometerModel.of_receiver(navigation, period_s)
-                if isinstance(navigation, Gnss) and navigation.barometer
+                if isinstance(navigation, Gnss) and navigation.barometer != "none"
                 else None
             ),
             dispute_limit_s=math.inf if navigation.dispute_limit_s is None else navigation.dispute_limit_s,

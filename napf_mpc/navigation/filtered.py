@@ -77,7 +77,7 @@ class FilteredNavigation:
         self._overbound: Overbound | None = None
         self._sensors = Sensors(navigation, seed, runs, uavs, period_s, velocity)
         self._barometers: Barometers | None = None
-        if isinstance(navigation, Gnss) and navigation.barometer:
+        if isinstance(navigation, Gnss) and navigation.barometer != "none":
             self._barometers = Barometers(navigation, seed, runs, uavs, period_s * ticks_per_fix)
         model = FilterModel.of_navigation(navigation, period_s, ticks_per_fix)
         self._filter: KalmanFilter | PointMassFilter

@@ -72,9 +72,10 @@ class ScaleEvidence(Monitor):
         array, shape (run, uav, 3)
             Factor on :attr:`~napf_mpc.navigation.monitor.Monitor.scale`, already in it.
         """
-        usual = self._log_density(off, variance, sigma[..., None])
-        said = weight[..., None] * (self._log_density(off, variance, sigma[..., None] * SCALES) - usual)
-        said = np.where(np.isfinite(said) & self._axes[:, None], said, 0.0)
+        # An unknown sigma is no statement that a fix could contradict.
+        told = np.where((sigma > 0.0) & (sigma < np.inf) & self._axes, sigma, np.nan)[..., None]
+        says = self._log_density(off, variance, told * SCALES) - self._log_density(off, variance, told)
+        said = np.where(np.isfinite(says), weight[..., None] * says, 0.0)
         odds = self._odds + said[:, :, 0] + said[:, :, 1] + said[:, :, 2]
         # Not much more than an alarm takes is kept, or an honest sigma would be long in being believed again.
         odds -= np.maximum(odds.max(axis=-1, keepdims=True) - 2.0 * ALARM, 0.0)

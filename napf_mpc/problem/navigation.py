@@ -32,7 +32,7 @@ class _NavigationBase(Section):
     innovation_gate_sigma: float = Field(5.0, ge=0.0, le=100.0)
     """Filter: a fix farther than this many sigmas from what is expected is refused; 0 for no gate."""
     monitor: Literal["none", "innovations"] = "none"
-    """Filter: whether its normalised innovations are watched, reported sigmas that are too small scaled, and fixes that contradict the estimate held out while the UAV holds (docs/integrity.md)."""  # noqa: E501
+    """Filter: whether its normalised innovations are watched, reported sigmas that are too small scaled, and by the Kalman filter fixes that contradict the estimate held out while the UAV holds (docs/integrity.md)."""  # noqa: E501
     filter_correlation_time_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
     """Filter: correlation time that it assumes of the fix's error; by default the error's own."""
     student_degrees_of_freedom: float = Field(3.0, ge=2.5, le=1e6)
@@ -40,7 +40,7 @@ class _NavigationBase(Section):
     filter_coast_sigma_m: float = Field(10.0, ge=1e-3, le=1e4)
     """Filter: without a fix, the solution counts as available up to this sigma of an axis."""
     dispute_limit_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
-    """Filter with the monitor: when fixes and estimate have been in dispute this long, it begins anew with the fix; by default it does not while its own sigma is below ``filter_coast_sigma_m`` (docs/integrity.md)."""  # noqa: E501
+    """Kalman filter with the monitor: when fixes and estimate have been in dispute this long, it begins anew with the fix; by default it does not while its own sigma is below ``filter_coast_sigma_m`` (docs/integrity.md)."""  # noqa: E501
 
 
 class GaussMarkov(_NavigationBase):
@@ -189,8 +189,8 @@ class Gnss(_NavigationBase):
     """Protection levels: chance that a signal on the horizon is a reflection alone, before its C/N0 is known; it falls with the angle to 0 in the zenith."""  # noqa: E501
     p_satellite: float = Field(1e-5, ge=0.0, le=0.1)
     """Protection levels: chance that a satellite is faulty."""
-    barometer: bool = False
-    """Whether each UAV has a barometer too: the filter learns its offset from the receiver's heights, and keeps the height by it where no fix comes."""  # noqa: E501
+    barometer: Literal["none", "offset"] = "none"
+    """Whether each UAV has a barometer too, with an offset that the filter learns from the receiver's heights and then keeps the height by where no fix comes."""  # noqa: E501
     barometer_weather_m: float = Field(8.0, ge=0.0, le=1e4)
     """Barometer: sigma of the offset by the weather, the same for all UAVs (8 m are 1 hPa)."""
     barometer_weather_time_s: float = Field(10_800.0, ge=1.0, le=1e7)
@@ -227,10 +227,10 @@ class Gnss(_NavigationBase):
             raise ValueError("common_mode_share must be left out: it follows from the satellites in common")
         if (self.origin_latitude_deg is None) != (self.origin_longitude_deg is None):
             raise ValueError("origin_latitude_deg and origin_longitude_deg go together: give both or none")
-        if self.barometer and self.filter == "none":
+        if self.barometer != "none" and self.filter == "none":
             raise ValueError(
-                'barometer = true, but filter = "none": it takes one to learn its offset; set filter = '
-                '"point_mass" or "kalman", or leave the barometer out'
+                f'barometer = "{self.barometer}", but filter = "none": it takes one to learn its offset; set '
+                'filter = "point_mass" or "kalman", or leave the barometer out'
             )
         if self.file is None and set(self.systems) == {"QZSS"}:
             raise ValueError("systems: QZSS is in files only; name one, or receive GPS or Galileo")

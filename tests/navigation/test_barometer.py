@@ -28,7 +28,7 @@ NAMES = ("kalman", "point_mass")
 
 def receiver(**keys: Any) -> Gnss:
     """Receiver with a barometer."""
-    settings: dict[str, Any] = {"kind": "gnss", "filter": "kalman", "barometer": True}
+    settings: dict[str, Any] = {"kind": "gnss", "filter": "kalman", "barometer": "offset"}
     # To the point-mass filter, too, the error is one of time: these UAVs stand.
     settings |= {"filter_correlation_time_s": 2.0, "filter_standing_time_s": 2.0}
     return Gnss.model_validate(settings | keys)
@@ -261,32 +261,32 @@ def test_the_offset_wanders_as_assumed() -> None:
 
 
 def test_it_takes_a_filter() -> None:
-    with pytest.raises(ProblemError, match='barometer = true, but filter = "none"'):
-        load_problem("street_canyon_gnss", ["navigation.barometer=true", "navigation.filter=none"])
+    with pytest.raises(ProblemError, match='barometer = "offset", but filter = "none"'):
+        load_problem("street_canyon_gnss", ["navigation.barometer=offset", "navigation.filter=none"])
     with pytest.raises(ProblemError, match="barometer"):
-        load_problem("study_8s", ["navigation.barometer=true"])
+        load_problem("study_8s", ["navigation.barometer=offset"])
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_without_fixes_the_height_is_held(name: str) -> None:
     """The street, 20 s of fixes and 40 s of none: the height stays, and is lost without a barometer."""
     error, sigma = {}, {}
-    for barometer in (False, True):
-        keys = [f"navigation.filter={name}", f"navigation.barometer={str(barometer).lower()}"]
+    for barometer in ("none", "offset"):
+        keys = [f"navigation.filter={name}", f"navigation.barometer={barometer}"]
         problem = load_problem("street_canyon_gnss", keys)
         flown = navigate(problem, 300, range(12), seconds=60.0, outage_s=(20.0, 60.0))
         error[barometer] = flown.error[..., 2]
         sigma[barometer] = np.sqrt(flown.covariance[..., 2, 2])
         # The receiver's own errors have tails that no sigma tells, and the offset was learnt from them.
         assert np.mean(np.abs(error[barometer][20:]) < 3.0 * sigma[barometer][20:]) > 0.97
-    assert np.median(np.abs(error[True][59] - error[True][19])) < 1.5
-    assert np.median(np.abs(error[False][59] - error[False][19])) > 6.0
-    assert np.median(sigma[True][59]) < 1.2 * np.median(sigma[True][19])
-    assert np.median(sigma[False][59]) > 12.0
+    assert np.median(np.abs(error["offset"][59] - error["offset"][19])) < 1.5
+    assert np.median(np.abs(error["none"][59] - error["none"][19])) > 6.0
+    assert np.median(sigma["offset"][59]) < 1.2 * np.median(sigma["offset"][19])
+    assert np.median(sigma["none"][59]) > 12.0
 
 
 def test_missions_do_not_depend_on_the_block_and_do_on_the_barometer() -> None:
-    keys = ["simulation.time_limit_s=4", "navigation.barometer=true"]
+    keys = ["simulation.time_limit_s=4", "navigation.barometer=offset"]
     problem = load_problem("street_canyon_gnss", keys)
     whole = fly_block(problem, ["napf"], 3, range(4)).rows
     parts = [fly_block(problem, ["napf"], 3, range(a, a + 2)).rows for a in (0, 2)]

@@ -165,5 +165,5 @@ def test_the_filter_says_more_of_what_it_is_worth() -> None:
 
 
 def test_without_a_filter_there_is_nothing_to_watch() -> None:
-    with pytest.raises(ProblemError, match="watches the Kalman filter's innovations"):
+    with pytest.raises(ProblemError, match="watches a filter's innovations"):
         load_problem("study_8s", [WATCHED])

@@ -547,8 +547,3 @@ def test_what_uavs_have_in_common_is_not_told() -> None:
     nav = Standing(navigation, 2).fed(0.0)
     own = nav.position_covariance
     np.testing.assert_array_equal(nav.relative_covariance(0, 1), own[:, 0] + own[:, 1])
-
-
-def test_it_has_no_monitor() -> None:
-    with pytest.raises(Exception, match=r'monitor = "innovations" watches the Kalman filter'):
-        load_problem("study_8s", {"navigation.filter": "point_mass", "navigation.monitor": "innovations"})
