@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled, compiled_bare
 
-__all__ = ["NUMBERS", "VERTICAL", "begin", "carry", "follow", "learn", "take_in_heights"]
+__all__ = ["NUMBERS", "VERTICAL", "begin", "carry", "follow", "learn", "shift", "take_in_heights"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -30,6 +30,14 @@ def begin(offset: Array, variance: float) -> None:
     """Know nothing of an offset but the variance of its law [m^2]."""
     offset[:] = 0.0
     offset[OO] = variance
+
+
+@compiled_bare
+def shift(offset: Array, by: float, variance: float) -> None:
+    """Take in that the height was another all the time, so that the offset is off by as much [m]."""
+    mean = offset[MEAN] + by
+    begin(offset, variance)
+    offset[MEAN] = mean
 
 
 @compiled_bare
@@ -146,7 +154,8 @@ def take_in_heights(
                 miss, spread = height[r, i] - x[0], c[0] + variance + noise
                 if miss * miss > gate * gate * spread:
                     # Farther than any offset: taken as it is, so that the next heights can be told from it.
-                    o[MEAN], miss = miss, 0.0
+                    shift(o, miss, variance)
+                    miss = 0.0
             for n in range(4):
                 seen[n] = c[n] + o[OP + n]
             own = o[OP] + o[OO]

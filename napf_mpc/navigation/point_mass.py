@@ -191,7 +191,7 @@ def correct(
                     if _is_elsewhere(astray[r, i, a], grid, off, sigma, degrees, weight):
                         _lay(x, c, p, grid, place, sigma, degrees)
                         if tied:
-                            height_offset.begin(offset[r, i], offset_variance)
+                            height_offset.shift(offset[r, i], -off, offset_variance)
                         outvoted = False
                         continue
                     _sharpen(p, spare, grid, off, sigma, degrees, weight)
