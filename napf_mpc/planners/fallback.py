@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 
 import numpy as np
@@ -15,10 +16,6 @@ Codes = NDArray[np.int8]
 
 TAIL_S = 1.0
 """Oldest plan whose tail is flown: navigation and neighbours have moved on by then [s]."""
-DESCEND_AFTER_S = 30.0
-"""Hovering without an accepted plan for this long ends in a descent [s]."""
-DESCENT_MPS = 0.5
-"""Speed of that descent [m/s]."""
 MOST_EVENTS = 1_000
 """Events of a run that are kept one by one; all uses are counted."""
 
@@ -33,7 +30,7 @@ class Action(IntEnum):
     HOVER = 2
     """Brake and hold the place."""
     DESCEND = 3
-    """Hold the place and go down."""
+    """Hold the place and go down, see :mod:`napf_mpc.planners.descent`."""
 
 
 class Ladder:
@@ -49,17 +46,21 @@ class Ladder:
         self.events: list[Event] = []
         """Every time that a UAV takes to an action other than a new plan."""
         self._kept = np.zeros(runs, dtype=np.int64)
-        self._hovering_since: Array = np.full((runs, uavs), np.nan)
         self._last: Codes = np.zeros((runs, uavs), dtype=np.int8)
 
     def all_accepted(self) -> Codes:
         """What :meth:`decide` says where every plan was accepted."""
-        self._hovering_since.fill(np.nan)
         self._last = np.zeros(self._last.shape, dtype=np.int8)  # Action.PLAN
         return self._last
 
     def decide(
-        self, time_s: float, accepted: Mask, age_s: Array, clear: Mask, causes: NDArray[np.object_]
+        self,
+        time_s: float,
+        accepted: Mask,
+        age_s: Array,
+        clear: Mask,
+        causes: NDArray[np.object_],
+        lower: Callable[[Mask], Mask] | None = None,
     ) -> Codes:
         """Choose what each UAV flies.
 
@@ -75,6 +76,8 @@ class Ladder:
             Whether its tail keeps clear of all obstacles.
         causes : array of str, shape (run, uav)
             Why the plan was refused; an empty word is no event, for a UAV that does not fly.
+        lower : callable, optional
+            Tells who goes down (run, uav) of those that can only hover (run, uav); by default nobody does.
 
         Returns
         -------
@@ -85,9 +88,8 @@ class Ladder:
         # A tail starts a plan's age too late to be rounded away by a clock of ten periods.
         action[(age_s <= TAIL_S + 1e-9) & clear] = Action.TAIL
         action[accepted] = Action.PLAN
-        hover = action == Action.HOVER
-        self._hovering_since = np.where(hover, np.fmin(self._hovering_since, time_s), np.nan)
-        action[hover & (time_s - self._hovering_since >= DESCEND_AFTER_S)] = Action.DESCEND
+        if lower is not None:
+            action[lower(action == Action.HOVER)] = Action.DESCEND
         changed = (action != self._last) & (action != Action.PLAN) & (causes != "")
         for run, uav in np.argwhere(changed).tolist():
             if self._kept[run] < MOST_EVENTS:  # of a run, whatever else flies with it

@@ -66,7 +66,7 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
         nav = self.inflation.informed(nav)
-        position, covariance, trusted = self._estimates(nav)
+        position, covariance, trusted = self._estimates(nav, time_s)
         ahead = None
         if settings.covariance == "expected":
             ahead = nav.position_covariance_ahead(self._horizon_s, with_fixes=True)[:, :, 0]

@@ -23,6 +23,7 @@ from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners import passes
 from napf_mpc.planners.cohesion import drawn_together
+from napf_mpc.planners.descent import Descent
 from napf_mpc.planners.fallback import Action, Codes, Ladder
 from napf_mpc.planners.guess import cut_at_obstacles
 from napf_mpc.planners.guidance import Guidance, guidance_covariance
@@ -165,6 +166,7 @@ class QpPlanner:
         self._guidance = Guidance(problem, self._inflation, margins=margins) if follows else None
         self._short = ShortMargins(problem, self._inflation) if problem.uav_count > 1 else None
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
+        self._descent = Descent(problem)
         self._period_s = 1.0 / settings.rate_hz
         step = stage_grid(self._period_s, settings.horizon, settings.look_ahead_s)
         self._grid = np.append(0.0, step)  # now, and the ends of the stages
@@ -197,6 +199,7 @@ class QpPlanner:
         if self._guidance is not None:
             self._guidance.reset(obstacles, runs)
         self.ladder = Ladder(runs, uavs)
+        self._descent.reset(obstacles, runs, uavs)
         self._counts = np.zeros((len(COLUMNS), runs), dtype=np.int64)
         self.tally = replace(Tally.over(self._counts), events=self.ladder.events)
         self._outlines: list[Hashable] = []
@@ -224,6 +227,7 @@ class QpPlanner:
             # A place held by a fix without a level would move with its error: hold by velocity.
             placed = trusted | np.isfinite(nav.position).all(-1)
         np.copyto(self._anchor, nav.position, where=placed[..., None])
+        self._descent.note(nav, trusted)
         state = self._state(nav, trusted)
         carried = self._carried(state, time_s)
         covariance = self._covariance(nav, trusted, self._planned(state, carried))
@@ -269,9 +273,7 @@ class QpPlanner:
         """Fly the plans; where the ladder says so, hold the last known place, or go down there."""
         position, velocity, direction = vectors = np.empty((3, *self._anchor.shape))
         planned, reason = np.empty(trusted.shape, dtype=np.bool_), np.empty(trusted.shape, dtype=np.int8)
-        passes.command(
-            action, trusted, flown.initial, self._anchor, plain(self._frame.up), vectors, planned, reason
-        )
+        passes.command(action, trusted, flown.initial, self._anchor, vectors, planned, reason)
         if guide is not None:
             reason = np.maximum(reason, waiting_reasons(guide))
         return Command(
@@ -469,6 +471,7 @@ class QpPlanner:
         )  # fmt: skip
         if causes is None:
             self._made_s[:] = time_s
+            self._descent.lower(time_s, ~accepted, self._anchor)
             return new, self.ladder.all_accepted()
         still = standing_plan(self.problem.vehicle, self._yaw, time_s, step_s, self._anchor)
         # Without navigation nothing tells whether the tail is followed; upset, it cannot be.
@@ -476,7 +479,11 @@ class QpPlanner:
         if clear.any():
             tail = still if old is None else old.resumed(time_s, step_s)
             clear &= self._clearance(tail) >= 0.0
-        action = self.ladder.decide(time_s, accepted, time_s - self._made_s, clear, causes)
+        age_s = time_s - self._made_s
+        action = self.ladder.decide(
+            time_s, accepted, age_s, clear, causes,
+            lambda hover: self._descent.lower(time_s, hover, self._anchor),
+        )  # fmt: skip
         self._made_s = np.where(accepted, time_s, self._made_s)
         return new.where(accepted, tail.where(action == Action.TAIL, still)), action
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled_bare
-from napf_mpc.planners.fallback import DESCENT_MPS, Action
+from napf_mpc.planners.descent import DESCENT_MPS
+from napf_mpc.planners.fallback import Action
 from napf_mpc.planners.planner import Reason
 from napf_mpc.qp import STATES
 from napf_mpc.solvers.acceptance import Refusal
@@ -135,8 +136,7 @@ def accept(
 
 @compiled_bare
 def command(
-    action: Codes, trusted: Mask, initial: Array, anchor: Array, up: Array, vectors: Array, planned: Mask,
-    reason: Codes,
+    action: Codes, trusted: Mask, initial: Array, anchor: Array, vectors: Array, planned: Mask, reason: Codes
 ) -> None:  # fmt: skip
     """Write position, velocity and direction (3, run, uav, 3), who follows a plan, and why one does not."""
     for run in range(action.shape[0]):
@@ -146,7 +146,7 @@ def command(
             planned[run, uav] = follows
             reason[run, uav] = _NO_REASON if follows else _SOLVER if trusted[run, uav] else _NAVIGATION
             for a in range(3):
-                down = (-DESCENT_MPS if code == _DESCEND else 0.0) * up[a]
+                down = -DESCENT_MPS if code == _DESCEND and a == 2 else 0.0
                 vectors[0, run, uav, a] = initial[run, uav, 2 * a] if follows else anchor[run, uav, a]
                 vectors[1, run, uav, a] = initial[run, uav, 2 * a + 1] if follows else down
                 vectors[2, run, uav, a] = 0.0 if follows else down

@@ -72,7 +72,8 @@ class Command:
 class Planner(Protocol):
     """A planner flies all runs in lock-step and owns its memory between steps.
 
-    One with a solver also has an attribute ``tally``, a :class:`~napf_mpc.planners.tally.Tally`.
+    One with a solver, or that counts its descents, also has an attribute ``tally``, a
+    :class:`~napf_mpc.planners.tally.Tally`.
     """
 
     @property
@@ -98,6 +99,6 @@ class Planner(Protocol):
 
 
 def tally_of(planner: Planner, runs: int) -> Tally:
-    """What a planner's solver did in each run; zeros for a planner that has none."""
+    """What a planner counted in each run; zeros for one that counts nothing."""
     tally = getattr(planner, "tally", None)
     return tally if isinstance(tally, Tally) else Tally.none(runs)

@@ -13,7 +13,9 @@ from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets, reference_speed, synchronisation_error
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
+from napf_mpc.planners.descent import DESCENT_MPS, Descent
 from napf_mpc.planners.planner import Command
+from napf_mpc.planners.tally import Event, Tally
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.world.moving import round_distance
@@ -50,9 +52,12 @@ class PotentialFieldPlanner:
         self._frame = PathFrame.of_mission(problem.mission)
         self._offsets = formation_offsets(problem.formation)
         self._lanes = self._frame.to_world(self._offsets * np.array([0.0, 1.0, 1.0]))
+        self._descent = Descent(problem)
         self._obstacles = ObstacleSet.empty()
         self._anchor: Array = np.zeros((0, 0, 3))
         self._placed: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
+        self._down: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
+        self.tally = Tally.none(0)
 
     @property
     def name(self) -> str:
@@ -62,15 +67,19 @@ class PotentialFieldPlanner:
     def reset(self, obstacles: ObstacleSet, runs: int) -> None:
         """Take a new map and forget where UAVs have been."""
         self._obstacles = obstacles
+        uavs = len(self._offsets)
         self._anchor = np.repeat(self._lanes[None], runs, axis=0)
-        self._placed = np.zeros((runs, len(self._offsets)), dtype=bool)
+        self._placed = np.zeros((runs, uavs), dtype=bool)
+        self._descent.reset(obstacles, runs, uavs)
+        self._down = np.zeros((runs, uavs), dtype=bool)
+        self.tally = Tally.none(runs)
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
         """Command of all UAVs from the reported solution and the map."""
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
         nav = self.inflation.informed(nav)
-        position, covariance, trusted = self._estimates(nav)
+        position, covariance, trusted = self._estimates(nav, time_s)
         error = synchronisation_error(self._frame.along_track(position), self._offsets[:, 0])
         speed = reference_speed(
             mission.speed_mps,
@@ -99,10 +108,11 @@ class PotentialFieldPlanner:
         )
         return self._hold(self._wait(command, nav), trusted)
 
-    def _estimates(self, nav: NavSolution) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def _estimates(self, nav: NavSolution, time_s: float) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Positions, their covariances and which of them are trusted; every number finite."""
         trusted = nav.trusted()
         self._move_anchors(nav, trusted)
+        self._lower_anchors(nav, trusted, time_s)
         if trusted.all():
             return nav.position, nav.position_covariance, trusted
         # What is not trusted must not reach the arithmetic, where NaN would spread to all UAVs by u_c.
@@ -152,6 +162,18 @@ class PotentialFieldPlanner:
         self._anchor = np.where(known[..., None], nav.position, self._anchor)
         self._placed |= known
 
+    def _lower_anchors(self, nav: NavSolution, trusted: NDArray[np.bool_], time_s: float) -> None:
+        """Lower the places of who has long been without navigation, and count it."""
+        self._descent.note(nav, trusted)
+        down = self._descent.lower(time_s, ~trusted, self._anchor)
+        flown = down if nav.airborne is None else down & nav.airborne
+        self.tally.counts["fall_back_descend"] += flown.sum(-1)
+        self.tally.events.extend(
+            Event(time_s, run, uav, "navigation", "descend")
+            for run, uav in np.argwhere(flown & ~self._down).tolist()
+        )
+        self._down = down
+
     def _wait(self, command: Command, nav: NavSolution) -> Command:
         """Let a formation brake and wait for a UAV whose navigation is disputed.
 
@@ -170,15 +192,19 @@ class PotentialFieldPlanner:
         )
 
     def _hold(self, command: Command, trusted: NDArray[np.bool_]) -> Command:
-        """Hover at the last trusted place where navigation is not to be trusted: never "no obstacle"."""
+        """Hover at the last trusted place, or go down, where navigation is not to be trusted.
+
+        Never as if there were no obstacle.
+        """
         if trusted.all():
             return command
-        lost = ~trusted[..., None]
+        lost, down = ~trusted[..., None], np.zeros(command.velocity.shape)
+        down[..., 2] = np.where(self._down, -1.0, 0.0)
         return replace(
             command,
             position=np.where(lost, self._anchor, command.position),
-            velocity=np.where(lost, 0.0, command.velocity),
-            direction=np.where(lost, 0.0, command.direction),
+            velocity=np.where(lost, DESCENT_MPS * down, command.velocity),
+            direction=np.where(lost, down, command.direction),
         )
 
 

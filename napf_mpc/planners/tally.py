@@ -1,4 +1,7 @@
-"""What a planner with a solver did in each run: solves by status, iterations, fall-backs, largest slack."""
+"""What a planner did in each run: solves by status, iterations, fall-backs, largest slack.
+
+Of one without a solver, its descents.
+"""
 
 from __future__ import annotations
 

@@ -2,18 +2,24 @@
 
 import numpy as np
 
-from napf_mpc.planners.fallback import DESCEND_AFTER_S, MOST_EVENTS, TAIL_S, Action, Ladder
+from napf_mpc.planners.fallback import MOST_EVENTS, TAIL_S, Action, Ladder
 
 
 def decide(
-    ladder: Ladder, time_s: float, accepted: bool, age_s: float, clear: bool, cause: str = "status"
+    ladder: Ladder,
+    time_s: float,
+    accepted: bool,
+    age_s: float,
+    clear: bool,
+    cause: str = "status",
+    down: bool = False,
 ) -> int:
     one = np.array([[True]])
-    return int(
-        ladder.decide(time_s, one & accepted, np.full((1, 1), age_s), one & clear, np.full((1, 1), cause))[
-            0, 0
-        ]
-    )
+    action = ladder.decide(
+        time_s, one & accepted, np.full((1, 1), age_s), one & clear, np.full((1, 1), cause),
+        lambda hover: hover & down,
+    )  # fmt: skip
+    return int(action[0, 0])
 
 
 def test_an_accepted_plan_flies_whatever_the_old_one_is() -> None:
@@ -28,15 +34,15 @@ def test_a_tail_flies_only_while_it_is_young_and_clear() -> None:
     assert decide(Ladder(1, 1), 5.0, False, np.nan, True) == Action.HOVER
 
 
-def test_a_long_hover_ends_in_a_descent_and_any_plan_ends_both() -> None:
+def test_a_hover_ends_in_a_descent_and_any_plan_ends_both() -> None:
     ladder = Ladder(1, 1)
     assert decide(ladder, 10.0, False, np.inf, True) == Action.HOVER
-    assert decide(ladder, 10.0 + DESCEND_AFTER_S - 0.1, False, np.inf, True) == Action.HOVER
-    assert decide(ladder, 10.0 + DESCEND_AFTER_S, False, np.inf, True) == Action.DESCEND
-    assert decide(ladder, 41.0, True, 0.0, True) == Action.PLAN
-    assert decide(ladder, 42.0, False, np.inf, True) == Action.HOVER
-    assert [event.action for event in ladder.events] == ["hover", "descend", "hover"]
-    assert [event.time_s for event in ladder.events] == [10.0, 10.0 + DESCEND_AFTER_S, 42.0]
+    assert decide(ladder, 40.0, False, np.inf, True, down=True) == Action.DESCEND
+    assert decide(ladder, 41.0, True, 0.0, True, down=True) == Action.PLAN
+    assert decide(ladder, 41.5, False, 0.5, True, down=True) == Action.TAIL
+    assert decide(ladder, 43.0, False, np.inf, True) == Action.HOVER
+    assert [event.action for event in ladder.events] == ["hover", "descend", "tail", "hover"]
+    assert [event.time_s for event in ladder.events] == [10.0, 40.0, 41.5, 43.0]
 
 
 def test_every_uav_has_a_ladder_of_its_own_and_its_events_name_it() -> None:
