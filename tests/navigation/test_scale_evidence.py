@@ -15,7 +15,7 @@ from napf_mpc.lanes import navigate
 from napf_mpc.navigation.filter import FilterModel
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.scale_evidence import SCALES, ScaleEvidence
-from napf_mpc.problem import GaussMarkov
+from napf_mpc.problem import GaussMarkov, Gnss
 from napf_mpc.problem_file import load_problem
 
 Array = NDArray[np.float64]
@@ -96,6 +96,13 @@ def test_the_scale_goes_when_sigmas_hold_again_and_never_below_one() -> None:
     assert scales.min() == 1.0
 
 
+def test_a_factor_between_two_scales_is_not_an_alarm_again_and_again() -> None:
+    evidence = ScaleEvidence(3.0, ALL, 100, 1)
+    fed(evidence, 4.75 * student(100, 400, 13))
+    assert (evidence.alarms >= 3).all()  # one an axis
+    assert np.median(evidence.alarms) <= 9
+
+
 def test_axes_of_another_sensor_are_left_alone() -> None:
     evidence = ScaleEvidence(3.0, np.array([True, True, False]), 20, 1)
     fed(evidence, 5.0 * student(20, 40, 8))
@@ -154,6 +161,28 @@ def test_the_filter_is_told_and_tells(scale: float, found: bool) -> None:
         assert 0.2 < ratio < 1.5
     else:
         assert share < 0.02
+
+
+@pytest.mark.parametrize("grown", [4.0, 0.25])
+def test_an_alarm_makes_uncertain_what_came_of_the_fixes(
+    grown: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sigmas twice as large: the position is, with all that it has in common; half as large changes nothing."""
+    keys = {"kind": "gnss", "filter": "point_mass", "monitor": "innovations", "barometer": "offset"}
+    watched = PointMassFilter(FilterModel.of_navigation(Gnss.model_validate(keys), 0.1, 1), 3.0, 1, 1)
+    active, shape, there = np.ones(1, dtype=bool), (1, 1, 3), np.ones((1, 1), dtype=bool)
+    for _ in range(30):
+        watched.take_in_heights(np.zeros((1, 1)), active)
+        watched.correct(np.zeros(shape), np.zeros(shape), 9.0 * np.eye(3)[None, None], there, True, active)
+        watched.predict(np.zeros(shape), active)
+    before, offset = watched._packed.copy(), watched._offset.copy()
+    monkeypatch.setattr(ScaleEvidence, "observe", lambda self, *told: np.full(shape, grown))
+    watched._watched(np.zeros(shape), np.ones(shape), np.ones(shape), there)
+    root = max(np.sqrt(grown), 1.0)
+    factors = np.ones(10)
+    factors[[0, 1, 3]] = root**2, root, root
+    np.testing.assert_allclose(watched._packed, before * factors, rtol=1e-12)
+    np.testing.assert_allclose(watched._offset, offset * [1.0, root, 1.0, 1.0, 1.0, 1.0], rtol=1e-12)
 
 
 def test_flagged_in_the_street_and_in_its_results() -> None:
