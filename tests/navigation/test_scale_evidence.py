@@ -167,7 +167,7 @@ def test_the_filter_is_told_and_tells(scale: float, found: bool) -> None:
 def test_an_alarm_makes_uncertain_what_came_of_the_fixes(
     grown: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Sigmas twice as large: the position is, with all that it has in common; half as large changes nothing."""
+    """Sigmas twice as large: so is the position, and what it has in common; half as large: nothing."""
     keys = {"kind": "gnss", "filter": "point_mass", "monitor": "innovations", "barometer": "offset"}
     watched = PointMassFilter(FilterModel.of_navigation(Gnss.model_validate(keys), 0.1, 1), 3.0, 1, 1)
     active, shape, there = np.ones(1, dtype=bool), (1, 1, 3), np.ones((1, 1), dtype=bool)
