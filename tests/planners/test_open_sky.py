@@ -25,7 +25,7 @@ from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.world.obstacles import ObstacleSet
-from napf_mpc.world.shapes import Cylinder, Shape
+from napf_mpc.world.shapes import Box, Cylinder, Shape
 
 Array = NDArray[np.float64]
 
@@ -227,6 +227,21 @@ def test_a_pillar_on_the_open_side_is_not_hit(weight: float, taut: bool) -> None
     world = np.array([made._path.to_world(place) for place in places]).reshape(1, -1, 3)
     clearance = made._obstacles.signed_distance(world).min() - RADIUS
     assert clearance > 3.0 * SIGMA - SETTINGS.tolerance_m
+
+
+def test_a_low_wall_is_climbed_as_without_a_price_and_farther_on_the_open_side() -> None:
+    """30 m to both sides, its top 2 m above the lanes; higher up the sky is better, too."""
+    wall: list[Shape] = [Box((40.0, 0.0, 11.0), (4.0, 60.0, 22.0))]
+    nodes = HALVES.nodes * np.array([1.5, 1.0, 0.6, 0.4])[:, None]
+    clearance, left = [], []
+    for weight in (0.0, 10.0):
+        made = guidance(weight, wall)
+        places, _ = fly(made, replace(HALVES, nodes=nodes))
+        world = np.array([made._path.to_world(place) for place in places]).reshape(1, -1, 3)
+        clearance.append(made._obstacles.signed_distance(world).min() - RADIUS)
+        left.append((places[-1][:, 1] - LANES[:, 1]).mean())
+    assert clearance[1] > clearance[0] - 0.05 > 1.0
+    assert left[1] < -2.0 < left[0]
 
 
 def test_no_sky_outbids_a_breach_that_counts_as_blocked() -> None:
