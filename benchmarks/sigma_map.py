@@ -1,6 +1,7 @@
 """Whether covariance that follows the place, Sigma(p), predicts better, and what the QP planner makes of it.
 
     python benchmarks/sigma_map.py [--problem nishi_shinjuku_gnss --data DIR] [--runs N] [--seed S] [--lanes]
+                                   [--open-sky WEIGHT ...] [--planner napf_guided] [--room]
 
 Flies every run twice on the same skies, scenes and errors, with ``planner.covariance = "expected"`` and
 ``"mapped"``. On both flights the navigation filter is asked, once a second, what covariance it expects 2 s
@@ -10,6 +11,10 @@ Markdown. The score is 0.5 (ln variance + error^2 / variance), mean over axes: t
 
 With ``--lanes`` nobody flies: UAVs stay in their slots at the reference speed, and what their receivers
 report is held against the map, and against what was reported some metres before.
+
+With ``--open-sky`` runs fly also with those weights of ``planner.open_sky_weight``, and nothing is forecast:
+each is held against "mapped" without a price, and what the filter reports in flight against the errors it
+makes. With ``--room`` nobody flies: what would fixes be if the formation went elsewhere, walls or not?
 
 Seeds 300 to 399 are for development, 7000 to 7999 for reports.
 """
@@ -31,8 +36,10 @@ from napf_mpc.navigation.gnss import GnssScene
 from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.gnss_sigma import expected_variance
 from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.guide_sky import NO_FIX_M2
 from napf_mpc.planners.mpc import QpPlanner
 from napf_mpc.planners.planner import Command
+from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.risk import clustered_rate, mcnemar, wilson
@@ -105,6 +112,97 @@ def fly(problem: Problem, scenario: Scenario) -> tuple[Score, Watch, float]:
     began = time.process_time()
     flight = closed_loop(problem, Flown(problem, watch), scenario, (judge, watch))
     return judge.score(flight), watch, time.process_time() - began
+
+
+@dataclass
+class Certainty:
+    """Keeps once a second how certain the UAVs are of their places, and how wrong; an observer."""
+
+    reported: list[Array] = field(default_factory=list)
+    """(run,) mean over UAVs of the horizontal variance, both axes together [m^2]; NaN after the flight."""
+    error: list[Array] = field(default_factory=list)
+    """The same of the squared horizontal error [m^2]."""
+
+    def moved(self, time_s: float, before: Array, after: Array, active: Mask) -> None:
+        """Nothing is kept of the plant's steps."""
+
+    def ticked(
+        self, time_s: float, state: Array, nav: NavSolution, command: Command, inputs: Array, active: Mask
+    ) -> None:
+        """Keep what is known at whole seconds."""
+        if abs(time_s - round(time_s)) > 1e-6 or time_s < SETTLED_S:
+            return
+        variance = np.einsum("...aa->...a", nav.position_covariance)[..., :2].sum(-1).mean(-1)
+        error = ((nav.position - state[..., POSITION])[..., :2] ** 2).sum(-1).mean(-1)
+        self.reported.append(np.where(active, variance, np.nan))
+        self.error.append(np.where(active, error, np.nan))
+
+    def metrics(self) -> dict[str, Array]:
+        """Values (run,): median of the reported horizontal sigma, rms of the horizontal error [m]."""
+        sigma = np.nanmedian(np.sqrt(np.array(self.reported)), axis=0)
+        return {"sigma_m": sigma, "error_m": np.sqrt(np.nanmean(np.array(self.error), axis=0))}
+
+
+def open_sky(name: str, planner: str, weights: list[float], scenario: Scenario) -> None:
+    """Fly with and without prices of the sky, and print the tables."""
+    ways: dict[str, dict[str, object]] = {way: {"planner.covariance": way} for way in WAYS}
+    for weight in weights:
+        ways[f"weight {weight:g}"] = {"planner.covariance": "mapped", "planner.open_sky_weight": weight}
+    scores: dict[str, Score] = {}
+    shown = ("path_rms_m", "shape_rms_m", "min_clearance_m", "finish_time_s", "sigma_m", "error_m")
+    print(
+        "| planner | contact [95 %] | finished | path, rms [m] | shape, rms [m] | clearance [m] | finish [s] "
+        "| CPU | sigma [m] | error, rms [m] |"
+    )
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    for way, keys in ways.items():
+        problem = load_problem(name, keys)
+        judge, certainty = MissionScore(problem, scenario), Certainty()
+        began = time.process_time()
+        flight = closed_loop(problem, make_planner(planner, problem), scenario, (judge, certainty))
+        cost_s = time.process_time() - began
+        scores[way] = score = judge.score(flight)
+        score.metrics.update(certainty.metrics())
+        row = flight_row(way, score, cost_s)
+        print(row, spread(score, "sigma_m"), "|", spread(score, "error_m"), "|", flush=True)
+    mapped = scores.pop("mapped")
+    hit = np.asarray(mapped.obstacle_contact.any(-1))
+    for way, score in scores.items():
+        other = np.asarray(score.obstacle_contact.any(-1))
+        only = int((hit & ~other).sum()), int((other & ~hit).sum())
+        print(
+            f"\n{way}, less mapped, mean of pairs; contacts of one only: {only[0]} mapped, {only[1]} {way}; ",
+            end="",
+        )
+        print(f"McNemar p = {mcnemar(*only):.3g}")
+        for metric in shown:
+            change = score.metrics[metric] - mapped.metrics[metric]
+            print(f"- {metric}: {mean_with_interval(change[np.isfinite(change)])}")
+
+
+def room_rows(problem: Problem, scenario: Scenario) -> list[str]:
+    """Root mean square of the fix to be expected over lanes that are moved, the formation as a whole."""
+    made = scenario.sigma_map
+    assert made is not None
+    mission = formation_mission(problem)
+    frame, slots = PathFrame.of_mission(mission), formation_offsets(problem.formation)
+    along = np.arange(0.0, mission.length_m, 2.0)
+
+    def square(left_m: float, up_m: float) -> Array:
+        moved = [slots + np.array([place, left_m, up_m]) for place in along]
+        places = np.repeat(frame.to_world(np.array(moved).reshape(-1, 3))[None], len(scenario.runs), axis=0)
+        own, lasting = made.variance(places)
+        bound = np.minimum((own + lasting).sum(-1), NO_FIX_M2)
+        return np.asarray(bound.reshape(len(places), len(along), -1).mean(-1))
+
+    lefts = np.arange(-10.0, 10.1, 1.0)
+    over = np.array([square(left, 0.0) for left in lefts])
+    rows = [f"| on the lanes | {mean_with_interval(np.sqrt(square(0.0, 0.0).mean(-1)))} |"]
+    for most in (2.0, 5.0, 10.0):
+        best = over[np.abs(lefts) <= most].min(0)
+        rows.append(f"| best within {most:g} m aside | {mean_with_interval(np.sqrt(best.mean(-1)))} |")
+    rows.append(f"| 10 m higher | {mean_with_interval(np.sqrt(square(0.0, 10.0).mean(-1)))} |")
+    return rows
 
 
 def lane_rows(problem: Problem, seed: int, runs: int, folder: Path | None) -> list[str]:
@@ -195,20 +293,23 @@ def prediction_rows(label: str, watch: Watch) -> list[str]:
     return rows
 
 
+def spread(score: Score, name: str) -> str:
+    """Median of a metric over runs, with 5 % and 95 %."""
+    values = score.metrics[name][np.isfinite(score.metrics[name])]
+    low, median, high = np.quantile(values, (0.05, 0.5, 0.95))
+    return f"{median:.2f} [{low:.2f}, {high:.2f}]"
+
+
 def flight_row(way: str, score: Score, cost_s: float) -> str:
     """Line of one way to fly."""
     hit = np.asarray(score.obstacle_contact.any(-1))
     rate = wilson(int(hit.sum()), len(hit))
 
-    def middle(name: str) -> str:
-        values = score.metrics[name][np.isfinite(score.metrics[name])]
-        low, median, high = np.quantile(values, (0.05, 0.5, 0.95))
-        return f"{median:.2f} [{low:.2f}, {high:.2f}]"
-
     return (
         f"| {way} | {rate.count} / {rate.total}, {100 * rate.value:.1f} % [{100 * rate.low:.1f}, "
-        f"{100 * rate.high:.1f}] | {int(score.finished.sum())} | {middle('path_rms_m')} "
-        f"| {middle('shape_rms_m')} | {middle('min_clearance_m')} | {middle('finish_time_s')} "
+        f"{100 * rate.high:.1f}] | {int(score.finished.sum())} | {spread(score, 'path_rms_m')} "
+        f"| {spread(score, 'shape_rms_m')} | {spread(score, 'min_clearance_m')} "
+        f"| {spread(score, 'finish_time_s')} "
         f"| {cost_s / len(hit):.2f} s |"
     )
 
@@ -220,6 +321,9 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=7000)
     parser.add_argument("--lanes", action="store_true")
+    parser.add_argument("--open-sky", type=float, nargs="+")
+    parser.add_argument("--room", action="store_true")
+    parser.add_argument("--planner", choices=("qp", "napf_guided"), default="qp", help="with --open-sky")
     options = parser.parse_args()
     if options.lanes:
         problem = load_problem(options.problem, {"planner.covariance": "mapped", "navigation.rate_hz": 1.0})
@@ -228,6 +332,20 @@ def main() -> None:
             "| sigma foreseen | ln(sigma / reported), rms [95 %] | median [5 %, 95 %] |\n| --- | --- | --- |"
         )
         print("\n".join(lane_rows(problem, options.seed, options.runs, options.data)))
+        return
+    if options.room:
+        problem = load_problem(options.problem, {"planner.covariance": "mapped"})
+        scenario = build_scenario(problem, options.seed, range(options.runs), options.data)
+        print(f"{options.problem}, N = {options.runs}, seed {options.seed}")
+        print("| place | fix, three axes, rms [m] |\n| --- | --- |")
+        print("\n".join(room_rows(problem, scenario)))
+        return
+    if options.open_sky:
+        problem = load_problem(options.problem, {"planner.covariance": "mapped"})
+        scenario = build_scenario(problem, options.seed, range(options.runs), options.data)
+        print(f"{options.problem}, {options.planner}, N = {options.runs}, seed {options.seed}; ", end="")
+        print("median [5 %, 95 %] of runs\n")
+        open_sky(options.problem, options.planner, options.open_sky, scenario)
         return
     problems = {way: load_problem(options.problem, {"planner.covariance": way}) for way in WAYS}
     began = time.process_time()

@@ -17,12 +17,14 @@ from napf_mpc.constraints.passage import PassageMargins, half_space_margins
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame, formation_offsets, synchronisation_error
 from napf_mpc.jit import compiled_bare
+from napf_mpc.navigation.sigma_map import SigmaMap
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import SolidBoxes, frame_of, solid_boxes
 from napf_mpc.planners.guide_search import plan_all, resample_all
 from napf_mpc.planners.guide_settings import FINE, GuidanceSettings, search_of
+from napf_mpc.planners.guide_sky import NO_SKY, SkyField, sky_field
 from napf_mpc.planners.guide_traffic import TrafficPace, slowed
 from napf_mpc.planners.taut import pulled_taut
 from napf_mpc.problem import FormationMission, Problem
@@ -93,7 +95,9 @@ class Guidance:
         )
         if margins is None:
             margins = half_space_margins(inflation.k)
-        self._search = search_of(self.settings, margins, problem.vehicle.radius_m)
+        self._open_sky_weight = problem.planner.open_sky_weight
+        self._search = search_of(self.settings, margins, problem.vehicle.radius_m, self._open_sky_weight)
+        self._blind = search_of(self.settings, margins, problem.vehicle.radius_m)
         stations = (self._search.lattice.stations - 1) * FINE + 1
         self._step_m = self._search.lattice.step_m / FINE
         self.ahead_m: Array = self._step_m * np.arange(stations, dtype=np.float64)
@@ -111,6 +115,9 @@ class Guidance:
         self._profiles = np.zeros((runs, uavs, stations, 2))
         self._taut: Array | None = None
         self._missing = np.zeros((runs, uavs, stations))
+        self._kept = np.zeros((runs, uavs, stations))
+        self._sigma_map: SigmaMap | None = None
+        self._sky: SkyField = NO_SKY
         self._busy = np.zeros(runs, dtype=bool)
         self._planned_at = np.zeros((runs, uavs))
         self._position = np.repeat(self._path.to_world(self._slots)[None], runs, axis=0)
@@ -135,6 +142,7 @@ class Guidance:
         tracks: Tracks | None = None,
         taut: bool = False,
         flying: NDArray[np.bool_] | None = None,
+        sigma_map: SigmaMap | None = None,
     ) -> Guide:
         """Guide from what navigation reports; plans anew when its period has passed.
 
@@ -154,6 +162,8 @@ class Guidance:
             Whether new plans come with their taut ways, see :mod:`.taut`.
         flying : array of bool, shape (run,), optional
             Runs that still fly; the others keep the plans they have.
+        sigma_map : SigmaMap, optional
+            Where fixes will be good; read only with ``planner.open_sky_weight``.
 
         Returns
         -------
@@ -166,6 +176,7 @@ class Guidance:
         along = np.ascontiguousarray(place[..., 0])
         due = time_s >= self._next_s - 1e-9
         if due:
+            self._look_up(sigma_map)
             elapsed = 0.0 if np.isnan(self._last_s) else time_s - self._last_s
             self._plan(place, elapsed, taut, ~self._given_up if flying is None else flying & ~self._given_up)
             self._last_s = time_s
@@ -185,6 +196,18 @@ class Guidance:
         resample_all(profiles, along - self._planned_at, self._step_m, out)
         return out
 
+    def _look_up(self, sigma_map: SigmaMap | None) -> None:
+        """Take a new map of the sky, if there is one and anybody asks."""
+        if self._open_sky_weight <= 0.0 or sigma_map is self._sigma_map:
+            return
+        self._sigma_map, self._sky = sigma_map, NO_SKY
+        self._kept[:] = 0.0
+        if sigma_map is not None:
+            # Places are looked up along, left and up of this path.
+            assert np.array_equal(sigma_map.frame.axes, self._path.axes)
+            assert np.array_equal(sigma_map.frame.origin, self._path.origin)
+            self._sky = sky_field(sigma_map)
+
     def _plan(self, place: Array, elapsed_s: float, taut: bool, asked: NDArray[np.bool_]) -> None:
         # Stations stand still in the world: a gap must not open and close with where the samples fall.
         step = self.settings.step_m
@@ -197,6 +220,7 @@ class Guidance:
             self._boxes,
             self._obstacles.scene_start,
             self._frame,
+            self._sky,
             asked,
             along,
             offset,
@@ -205,9 +229,10 @@ class Guidance:
             self._separation(margin),
             last,
             self._stuck,
-            self._search,
+            self._blind if self._sky is NO_SKY else self._search,
             self._profiles,
             self._missing,
+            self._kept,
             self._busy,
         )
         self._planned_at = along
@@ -216,7 +241,7 @@ class Guidance:
             pulled, loose = pulled_taut(
                 self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
                 self._inflation.k, self._search.radius_m, self._extra_m, self._extra_sigmas,
-                self.settings.taut_slope,
+                self.settings.taut_slope, self._kept,
             )  # fmt: skip
             self._taut = np.concatenate([pulled, loose[..., None]], axis=-1)
         self._hold(offset, elapsed_s)

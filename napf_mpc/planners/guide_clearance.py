@@ -95,6 +95,8 @@ class Sight(NamedTuple):
     here_count: NDArray[np.int64]  # (uav, station)
     missing: Array  # (uav, station, layer, cell) shortfalls, 0 where nothing is short, where known
     known: NDArray[np.int64]  # (uav, station, layer, 2) first and last cell known, of each layer
+    has_sky: bool  # whether places have a price of their own, ...
+    sky: Array  # (uav, station, layer, cell) ... this one a metre; else not written
 
 
 @compiled_bare

@@ -35,6 +35,8 @@ class Prices(NamedTuple):
     aside: float  # a metre aside on the spot
     start: float  # squared distance of the profile's start from the UAV, once, in tight places [1/m^2]
     apart: float  # squared lack of separation from another UAV [1/m^2]
+    sky: float  # squared error of a fix, over that on the lane [1/m^2], ...
+    sky_most: float  # ... and what that approaches, of either sign, where it is large
 
 
 class Query(NamedTuple):
@@ -199,6 +201,8 @@ def price_of(
         for i in range(query.first, query.stop):
             price = own_price(left, up, bends[v, c], mean, last, i, f, query.shape, keep, prices)
             total += lattice.step_m * price
+            if sight.has_sky:
+                total += lattice.step_m * sight.sky[i, s, v, c]
             if here_count[i, s] > 0:
                 if c < known[i, s, v, 0] or c > known[i, s, v, 1]:
                     cover(sight, i, lattice, below, s, v, v, c, c)

@@ -171,6 +171,8 @@ def _pay(
             own = 0.0
             for i in range(query.first, query.stop):
                 own += step * own_price(left, up, bend, mean, last, i, f, query.shape, keep, prices)
+                if sight.has_sky:
+                    own += step * sight.sky[i, s, v, c]
             if there + own + ahead * bend > limit:
                 value[s, LAYER_HALO + v, HALO + c] = np.inf
                 continue

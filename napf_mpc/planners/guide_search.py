@@ -37,6 +37,7 @@ from napf_mpc.planners.guide_clearance import (
 from napf_mpc.planners.guide_lattice import Lattice, any_short, cover, list_here
 from napf_mpc.planners.guide_prices import Prices, Query, bend_offsets, price_ahead
 from napf_mpc.planners.guide_profile import HALO, LAYER_HALO, Bench, cheapest_profile
+from napf_mpc.planners.guide_sky import SkyField, add_sky, draws, keep_for_sky, price_sky, sky_price
 from napf_mpc.world.distance import Solids
 
 Array = NDArray[np.float64]
@@ -145,6 +146,7 @@ class Scratch(NamedTuple):
     here_count: NDArray[np.int64]
     missing: Array
     known: NDArray[np.int64]
+    sky: Array
     bench: Bench
     band: Band
 
@@ -166,6 +168,7 @@ def make_scratch(uavs: int, fine: int, most: int, search: Search) -> Scratch:
         np.empty((uavs, stations), dtype=np.int64),
         np.empty((uavs, stations, layers, cells)),
         np.empty((uavs, stations, layers, 2), dtype=np.int64),
+        np.empty((uavs, stations, layers, cells)),
         Bench(
             np.empty((stations, layers + 2 * LAYER_HALO, cells + 2 * HALO)),
             np.empty((layers, cells)),
@@ -191,6 +194,8 @@ def plan_run(
     first: int,
     stop: int,
     frame: Frame,
+    field: SkyField,
+    run: int,
     along: Array,
     offset: Array,
     lanes: Array,
@@ -201,6 +206,7 @@ def plan_run(
     search: Search,
     profiles: Array,
     missing: Array,
+    kept: Array,
     scratch: Scratch,
 ) -> bool:
     """Plan the profiles of one run's UAVs.
@@ -211,6 +217,8 @@ def plan_run(
         The scene: solids ``first`` to ``stop - 1``.
     frame : Frame
         The path's frame.
+    field, run : SkyField, int
+        What to expect of fixes, and whose row of it; read only with a price of the sky.
     along, offset : array, shape (uav,), (uav, 2)
         Where UAVs are: along the path, left and up of their lanes [m].
     lanes : array, shape (uav, 2)
@@ -227,13 +235,15 @@ def plan_run(
         Settings.
     profiles, missing : array, shape (uav, station, 2), (uav, station)
         Written: profiles, and their shortfalls [m].
+    kept : array, shape (uav, station)
+        Written with a price of the sky only: how far from the lane it is best to stay [m].
     scratch : Scratch
         Written over.
 
     Returns
     -------
     bool
-        Whether anything was in the way of the lanes or of the last profiles.
+        Whether anything was in the way of the lanes or of the last profiles, or drew UAVs off them.
     """
     prices = search.prices
     aside = prices.aside if stuck else -1.0
@@ -270,8 +280,11 @@ def plan_run(
     sight = Sight(
         solids, frame, search.margins, search.radius_m, need, along, lanes, covariance, scratch.turned, reach,
         found, count, scratch.near, scratch.here, scratch.here_count, scratch.missing, scratch.known,
+        prices.sky > 0.0 and prices.sky_most > 0.0,
+        scratch.sky,
     )  # fmt: skip
     in_the_way = 0
+    drawn = 0
     moved = False
     is_short = np.zeros(uavs, dtype=np.bool_)
     tight = np.zeros(uavs, dtype=np.bool_)
@@ -292,7 +305,14 @@ def plan_run(
             for s in range(fine):
                 away[i] = away[i] or abs(last[i, s, 0]) > AWAY_M or abs(last[i, s, 1]) > AWAY_M
             tight[i] = _tight(sight, i, offset[i], last[i, 0], lattice, below, layers)
-    if in_the_way == 0 and not moved:
+    if sight.has_sky:
+        for i in range(uavs):
+            worst = price_sky(field, run, along[i], lanes[i], lattice, below, layers, prices, sight.sky[i])
+            wanted = draws(worst, prices)
+            drawn += wanted
+            away[i] = away[i] or wanted
+        kept[:] = 0.0
+    if in_the_way == 0 and drawn == 0 and not moved:
         profiles[:] = 0.0
         missing[:] = 0.0
         return False
@@ -313,7 +333,7 @@ def plan_run(
     trial_missing = np.empty((uavs, fine))
     for draft in range(2):
         draft_mean[:] = mean
-        if draft == 1 and (in_the_way < 2 or missing.max() <= prices.spare_m):
+        if draft == 1 and drawn < 2 and (in_the_way < 2 or missing.max() <= prices.spare_m):
             # One way for all never was cheaper where each had found its own.
             break
         # In the second draft the way for all comes first, and draws the others.
@@ -350,6 +370,12 @@ def plan_run(
                 if tight[i]:
                     add_row(band.own, band.right, 0, prices.start, 1.0, 0.0, start[i, 0])
                     add_row(band.own, band.right, 0, prices.start, 0.0, 1.0, start[i, 1])
+                elif drawn > 0 and not stuck:
+                    # Where nothing stands near, nothing else holds the start: it would jump to the best sky.
+                    add_row(band.own, band.right, 0, PUSH, 1.0, 0.0, last[i, 0, 0])
+                    add_row(band.own, band.right, 0, PUSH, 0.0, 1.0, last[i, 0, 1])
+                if sight.has_sky:
+                    add_sky(sight.sky[i], lattice, below, layers, step, trial[i], band.own, band.right)
                 if is_short[i]:
                     take_solids(sight, i, step, PUSH, drafts[i], trial[i], band, trial_missing[i])
                 for j in range(uavs):
@@ -368,10 +394,18 @@ def plan_run(
             take_solids(sight, i, step, 0.0, drafts[i], trial[i], band, trial_missing[i])
         mean_profile(trial, draft_mean)
         price = band_price(trial, draft_mean, last, trial_missing, step, prices)
+        if sight.has_sky:
+            for i in range(uavs):
+                for s in range(fine):
+                    at = sky_price(sight.sky[i], lattice, below, layers, s, trial[i, s, 0], trial[i, s, 1])
+                    price += step * at
         if draft == 0 or price < search.shared_gain * best:
             best = price
             profiles[:] = trial
             missing[:] = trial_missing
+    if sight.has_sky:
+        for i in range(uavs):
+            keep_for_sky(sight.sky[i], lattice, below, layers, prices, profiles[i], kept[i])
     return True
 
 
@@ -381,6 +415,7 @@ def _plan_runs(
     boxes: SolidBoxes,
     scene_start: NDArray[np.int64],
     frame: Frame,
+    field: SkyField,
     due: NDArray[np.bool_],
     along: Array,
     offset: Array,
@@ -392,6 +427,7 @@ def _plan_runs(
     search: Search,
     profiles: Array,
     missing: Array,
+    kept: Array,
     busy: NDArray[np.bool_],
     scratch: Scratch,
 ) -> None:
@@ -400,8 +436,9 @@ def _plan_runs(
             continue
         scene = 0 if len(scene_start) == 2 else r
         busy[r] = plan_run(
-            solids, boxes, scene_start[scene], scene_start[scene + 1], frame, along[r], offset[r], lanes,
-            covariance[r], separation[r], last[r], stuck[r], search, profiles[r], missing[r], scratch,
+            solids, boxes, scene_start[scene], scene_start[scene + 1], frame, field, r, along[r], offset[r],
+            lanes, covariance[r], separation[r], last[r], stuck[r], search, profiles[r], missing[r], kept[r],
+            scratch,
         )  # fmt: skip
 
 
@@ -428,6 +465,7 @@ def plan_all(
     boxes: SolidBoxes,
     scene_start: NDArray[np.int64],
     frame: Frame,
+    field: SkyField,
     due: NDArray[np.bool_],
     along: Array,
     offset: Array,
@@ -439,6 +477,7 @@ def plan_all(
     search: Search,
     profiles: Array,
     missing: Array,
+    kept: Array,
     busy: NDArray[np.bool_],
 ) -> None:
     """Plan all runs that are due, each from its own scene and state alone; see :func:`plan_run`."""
@@ -446,8 +485,9 @@ def plan_all(
     # Powers of two, so that scenes of different size share scratch.
     most = min(MOST_SOLIDS, 1 << max(largest - 1, 1).bit_length())
     _plan_runs(
-        solids, boxes, scene_start, frame, due, along, offset, lanes, covariance, separation, last, stuck,
-        search, profiles, missing, busy, _KEPT.of(profiles.shape[1], profiles.shape[2], most, search),
+        solids, boxes, scene_start, frame, field, due, along, offset, lanes, covariance, separation, last,
+        stuck, search, profiles, missing, kept, busy,
+        _KEPT.of(profiles.shape[1], profiles.shape[2], most, search),
     )  # fmt: skip
 
 

@@ -68,6 +68,8 @@ class GuidanceSettings:
     """Price of a squared distance of the start from where the UAV is, where something is near [1/m^2]."""
     apart: float = 100.0
     """Price of a squared lack of separation between UAVs [1/m^2 per metre]."""
+    sky_share: float = 0.5
+    """Better sky gains, and worse costs, at most this share of the price of a breach by the tolerance."""
     apart_share: float = 0.6
     """Separation asked for is at most this share of the two slots' distance."""
     passes: int = 10
@@ -126,10 +128,11 @@ def _lattice(settings: GuidanceSettings, scale: int) -> Lattice:
     )
 
 
-def _prices(settings: GuidanceSettings, scale: int) -> Prices:
+def _prices(settings: GuidanceSettings, scale: int, open_sky_weight: float) -> Prices:
     """Prices with all lengths a number of times as long: the same shapes, only larger."""
+    path = settings.path if scale == 1 else settings.wide_path
     prices = (
-        settings.path if scale == 1 else settings.wide_path,
+        path,
         settings.shape,
         settings.far_m * scale,
         settings.slope * scale**2,
@@ -146,19 +149,26 @@ def _prices(settings: GuidanceSettings, scale: int) -> Prices:
         settings.aside,
         settings.start,
         settings.apart,
+        open_sky_weight * path,
+        settings.sky_share * settings.breach * settings.tolerance_m,
     )
     # A whole number is a number too, but to the compiled search another type.
     return Prices(*map(float, prices))
 
 
-def search_of(settings: GuidanceSettings, margins: PassageMargins, radius_m: float) -> Search:
-    """Settings in the form that the compiled search reads, for margins and a radius [m]."""
+def search_of(
+    settings: GuidanceSettings, margins: PassageMargins, radius_m: float, open_sky_weight: float = 0.0
+) -> Search:
+    """Settings in the form that the compiled search reads, for margins and a radius [m].
+
+    ``open_sky_weight`` is what a squared metre of a fix's variance costs, in squared metres of offset.
+    """
     return Search(
         _lattice(settings, 1),
         _lattice(settings, 2),
         settings.wide_m,
-        _prices(settings, 1),
-        _prices(settings, 2),
+        _prices(settings, 1, open_sky_weight),
+        _prices(settings, 2, open_sky_weight),
         margins,
         radius_m,
         settings.passes,

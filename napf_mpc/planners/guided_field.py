@@ -75,7 +75,9 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
             ahead = nav.position_covariance_ahead(self._times_s, True, position[:, :, None] + way)[:, :, -1]
         room = guidance_covariance(nav, trusted, ahead)
         flying = None if nav.airborne is None else np.asarray(nav.airborne.any(-1))
-        guide = self.guidance.step(position, room, trusted, time_s, nav.tracks, flying=flying)
+        guide = self.guidance.step(
+            position, room, trusted, time_s, nav.tracks, flying=flying, sigma_map=nav.sigma_map
+        )
         self.guide = guide
         place = self._frame.to_path(position)
         error = synchronisation_error(place[..., 0], self._offsets[:, 0])

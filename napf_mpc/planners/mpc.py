@@ -238,8 +238,9 @@ class QpPlanner:
             # Raw measurements jump by more than a taut way could gain.
             flying = np.asarray(airborne.any(-1))
             guide = self._guidance.step(
-                state[..., POSITION], room, trusted, time_s, taut=nav.filtered, flying=flying
-            )
+                state[..., POSITION], room, trusted, time_s, taut=nav.filtered, flying=flying,
+                sigma_map=nav.sigma_map,
+            )  # fmt: skip
         reference, way = self._references(state, carried, nav, covariance, trusted, guide)
         began = 0.0 if self._clock is None else self._clock()
         guess = self._guess(state, way, carried, time_s)

@@ -48,6 +48,7 @@ def pulled_taut(
     extra_m: float,
     extra_sigmas: float,
     slope: float,
+    stay: Array | None = None,
 ) -> tuple[Array, Array]:
     """Offsets as near to the lanes as the margins allow, and how loose they are.
 
@@ -75,6 +76,8 @@ def pulled_taut(
         Distance on top of the margin: so many sigmas, at most so many metres [m].
     slope : float
         At which a place leads back to the way, per metre of path.
+    stay : array, shape (run, uav, station), optional
+        How far from the lane a place stays though nothing is in between, as where the sky is better [m].
 
     Returns
     -------
@@ -85,9 +88,11 @@ def pulled_taut(
     """
     out = profiles.copy()
     loose = np.ones(profiles.shape[:3])
+    if stay is None:
+        stay = np.zeros(profiles.shape[:3])
     _pull(
         obstacles.solids, obstacles.tree, obstacles.scene_start, along, step_m, lanes, frame, covariance, k,
-        radius_m, extra_m, extra_sigmas, slope * step_m, out, loose,
+        radius_m, extra_m, extra_sigmas, slope * step_m, stay, out, loose,
     )  # fmt: skip
     return out, loose
 
@@ -149,6 +154,7 @@ def _pull(
     extra_m: float,
     extra_sigmas: float,
     most: float,
+    stay: Array,
     out: Array,
     loose: Array,
 ) -> None:
@@ -167,7 +173,7 @@ def _pull(
                 left, up = out[run, uav, s]
                 size = math.sqrt(left * left + up * up)
                 # Backwards: from here, what lies ahead has to be reached at no more than the slope.
-                limit = min(size - (ahead - most), size)
+                limit = min(size - (ahead - most), size - stay[run, uav, s])
                 ahead = size
                 if size < SAME_M or limit <= 0.0:
                     loose[run, uav, s] = 1.0 if size < SAME_M else 0.0

@@ -78,6 +78,8 @@ class Planner(Section):
     """With ``risk_per_mission``: correlation time of the position's error; by default navigation's own."""
     covariance: Literal["held", "expected", "mapped", "propagated"] = "expected"
     """QP planner: over the horizon, the covariance reported now; what the filter expects if fixes go on as now; with fixes as a sigma map has them at the planned places (navigation.kind "gnss"); or if none comes any more. Guidance leaves room for what is expected at the horizon's end, or for the one now."""  # noqa: E501
+    open_sky_weight: float = Field(0.0, ge=0.0, le=10.0)
+    """Guidance: price of a fix's variance as the sigma map expects it, its three axes together, in m^2 of squared offset from the lane for each m^2; 0 does not look at the sky. With covariance = "mapped"."""  # noqa: E501
     inflation: Literal["shift", "range"] = "shift"
     """k sigma shifts the distance to the obstacle, or only widens the range of influence."""
     sigma: Literal["directional", "largest", "rms", "chi2"] = "directional"

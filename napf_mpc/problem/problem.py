@@ -99,6 +99,18 @@ class Problem(Section):
                 'planner.covariance = "mapped" follows the satellites in sight of navigation.kind = "gnss": '
                 f'navigation.kind = "{navigation.kind}" has none; use covariance = "expected"'
             ]
+        if self.planner.open_sky_weight > 0.0:
+            weight = f"planner.open_sky_weight = {self.planner.open_sky_weight:g}"
+            if self.planner.covariance != "mapped":
+                return [
+                    f'{weight} reads a sigma map, planner.covariance = "{self.planner.covariance}" has none: '
+                    'set covariance = "mapped" (with navigation.kind = "gnss"), or open_sky_weight = 0'
+                ]
+            if self.planner.guidance == "none" and self.planner.kind != "napf_guided":
+                return [
+                    f'{weight} is a price that guidance pays, and planner.guidance = "none" has none: set '
+                    'guidance = "blended", or open_sky_weight = 0'
+                ]
         if self.planner.safety == "overbound":
             if not isinstance(navigation, Recorded):
                 return [

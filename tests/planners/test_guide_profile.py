@@ -62,8 +62,8 @@ def scene(seed: int, path: PathFrame, count: int) -> list[Shape]:
     return shapes
 
 
-def seen(shapes: list[Shape], path: PathFrame, covariance: Array) -> Sight:
-    """What two UAVs see that fly 4 m behind each other on the same lane."""
+def seen(shapes: list[Shape], path: PathFrame, covariance: Array, sky: Array | None = None) -> Sight:
+    """What two UAVs see that fly 4 m behind each other on the same lane, perhaps with prices of the sky."""
     obstacles = ObstacleSet.from_shapes(shapes)
     solids, boxes = obstacles.solids, solid_boxes(obstacles, path)
     scratch = make_scratch(2, 2 * LATTICE.stations - 1, len(shapes), SEARCH)
@@ -73,7 +73,10 @@ def seen(shapes: list[Shape], path: PathFrame, covariance: Array) -> Sight:
         np.tile(LANE, (2, 1)), np.tile(covariance, (2, 1, 1)), scratch.turned, scratch.reach,
         scratch.found, scratch.solid_count,
         scratch.near, scratch.here, scratch.here_count, scratch.missing, scratch.known,
+        sky is not None, scratch.sky,
     )  # fmt: skip
+    if sky is not None:
+        sight.sky[:, : LATTICE.stations, :LAYERS, :CELLS] = sky
     for i in range(2):
         sight.reach[i] = largest_reach(covariance, SEARCH.margins.k, need)
         sight.solid_count[i] = gather(
@@ -185,6 +188,8 @@ def node_prices(sight: Sight, query: Query, missing: list[Array]) -> Array:
             price += query.shape * bent(float(((place - query.mean[f]) ** 2).sum()), PRICES.far_m)
             price += keep * min(float(((place - query.last[i, f]) ** 2).sum()), PRICES.keep_m**2)
             price += missing_price(float(missing[i][s, v, c]), PRICES)
+            if sight.has_sky:
+                price += float(sight.sky[i, s, v, c])
             if s > 0 and query.stop - query.first == 1:
                 for j in range(i):
                     gap = np.array([sight.along[i] - sight.along[j], *(place - query.chosen[j, s])])
@@ -215,12 +220,14 @@ def test_shortfalls_are_those_of_every_solid_in_whatever_order_they_are_asked_fo
     np.testing.assert_allclose(got, wanted, atol=1e-9)
 
 
+@pytest.mark.parametrize("most_sky", [0.0, 40.0, 1300.0])
 @pytest.mark.parametrize("aside", [-1.0, PRICES.aside])
 @pytest.mark.parametrize("seed", [1, 2, 3, 4])
-def test_what_is_left_out_was_not_cheaper(seed: int, aside: float) -> None:
+def test_what_is_left_out_was_not_cheaper(seed: int, aside: float, most_sky: float) -> None:
     rng = np.random.default_rng(seed)
     shapes = scene(seed, LEVEL, 4 * seed)
-    sight = seen(shapes, LEVEL, np.eye(3) * 0.3**2)
+    sky = np.random.default_rng(90 + seed).uniform(0.0, most_sky, (2, LATTICE.stations, LAYERS, CELLS))
+    sight = seen(shapes, LEVEL, np.eye(3) * 0.3**2, sky if most_sky > 0.0 else None)
     missing = [all_missing(sight, shapes, LEVEL, i) for i in range(2)]
     fine = 2 * LATTICE.stations - 1
     last = np.cumsum(rng.normal(0.0, 0.3, (2, fine, 2)), axis=1)

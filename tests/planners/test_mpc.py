@@ -329,8 +329,11 @@ def test_a_filtered_estimate_follows_the_taut_way_and_raw_measurements_the_guide
     everybody, asked = raw.trusted(), []
     for solution in (raw, replace(raw, filtered=True)):
 
-        def step(*_: object, taut: bool, flying: np.ndarray, shown: Guide = guide) -> Guide:
+        def step(
+            *_: object, taut: bool, flying: np.ndarray, sigma_map: object, shown: Guide = guide
+        ) -> Guide:
             assert flying.all()
+            assert sigma_map is None
             asked.append(taut)
             return shown if taut else replace(shown, taut=None, loose=None)
 
