@@ -97,7 +97,7 @@ class Problem(Section):
         if self.planner.covariance == "mapped" and not isinstance(navigation, Gnss):
             return [
                 'planner.covariance = "mapped" follows the satellites in sight of navigation.kind = "gnss": '
-                f'navigation.kind = "{navigation.kind}" has none; use covariance = "expected"'
+                f'navigation.kind = "{navigation.kind}" has none: use covariance = "expected"'
             ]
         if self.planner.open_sky_weight > 0.0:
             weight = f"planner.open_sky_weight = {self.planner.open_sky_weight:g}"
