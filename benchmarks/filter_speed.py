@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from napf_mpc.navigation.error_models import position_errors
-from napf_mpc.navigation.filter import FilterModel, KalmanFilter
+from napf_mpc.navigation.filter import KalmanFilter
+from napf_mpc.navigation.filter_model import FilterModel
 from napf_mpc.navigation.filtered import FilteredNavigation
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.sensors import Sensors

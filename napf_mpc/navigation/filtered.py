@@ -15,7 +15,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.navigation.filter import FilterModel, KalmanFilter
+from napf_mpc.navigation.filter import KalmanFilter
+from napf_mpc.navigation.filter_model import FilterModel
 from napf_mpc.navigation.fix import FixSource, PlacedErrors, PositionErrors, fixes_of_flight
 from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.integrity.overbound import Overbound

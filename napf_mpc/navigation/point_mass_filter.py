@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.navigation import height_offset, kalman, point_mass
-from napf_mpc.navigation.filter import RECEIVER_NOISE_M, FilterModel
+from napf_mpc.navigation.filter_model import RECEIVER_NOISE_M, FilterModel
 from napf_mpc.navigation.fix import is_symmetric
 from napf_mpc.navigation.fix_record import FixRecord
 from napf_mpc.navigation.forecast import CovarianceForecast

@@ -13,7 +13,8 @@ from napf_mpc.block import fly_block
 from napf_mpc.errors import ProblemError
 from napf_mpc.lanes import navigate
 from napf_mpc.navigation import kalman
-from napf_mpc.navigation.filter import BarometerModel, FilterModel, KalmanFilter
+from napf_mpc.navigation.filter import KalmanFilter
+from napf_mpc.navigation.filter_model import BarometerModel, FilterModel
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.sensors import Barometers
 from napf_mpc.problem import Gnss

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from napf_mpc.navigation.filter import CALM_S, FilterModel, KalmanFilter
+from napf_mpc.navigation.filter import CALM_S, KalmanFilter
+from napf_mpc.navigation.filter_model import FilterModel
 from napf_mpc.navigation.fix_record import GATE_PATIENCE_S
 from napf_mpc.problem import GaussMarkov
 

@@ -19,7 +19,8 @@ from napf_mpc.closed_loop import ATTITUDE, POSITION, RATES, VELOCITY, build_scen
 from napf_mpc.navigation import cross_covariance, kalman
 from napf_mpc.navigation.consistency import normalised_errors
 from napf_mpc.navigation.error_models import gauss_markov_errors, position_errors
-from napf_mpc.navigation.filter import RECEIVER_NOISE_M, FilterModel, KalmanFilter
+from napf_mpc.navigation.filter import KalmanFilter
+from napf_mpc.navigation.filter_model import RECEIVER_NOISE_M, FilterModel
 from napf_mpc.navigation.filtered import FilteredNavigation
 from napf_mpc.navigation.fix import Fix, PositionErrors
 from napf_mpc.navigation.fix_record import GATE_PATIENCE_S

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napf_mpc.navigation.filter import FilterModel, KalmanFilter
+from napf_mpc.navigation.filter import KalmanFilter
+from napf_mpc.navigation.filter_model import FilterModel
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import ConstantBias, GaussMarkov, Navigation, Recorded
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napf_mpc.navigation.filter import FilterModel, KalmanFilter
+from napf_mpc.navigation.filter import KalmanFilter
+from napf_mpc.navigation.filter_model import FilterModel
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.problem import ConstantBias, GaussMarkov, Gnss, Recorded

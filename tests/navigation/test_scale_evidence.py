@@ -12,7 +12,7 @@ from scipy import stats
 from napf_mpc.block import fly_block, simulate
 from napf_mpc.errors import ProblemError
 from napf_mpc.lanes import navigate
-from napf_mpc.navigation.filter import FilterModel
+from napf_mpc.navigation.filter_model import FilterModel
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
 from napf_mpc.navigation.scale_evidence import SCALES, ScaleEvidence
 from napf_mpc.problem import GaussMarkov, Gnss
