@@ -11,8 +11,9 @@ to the logarithm of the odds of s against 1, with :math:`t_\nu` the Student law'
 what the fix is worth beside the one before (:mod:`.point_mass`). Evidence of all axes that the receiver
 measures is taken together: one that believes too much does so on all of them. Below none it does not fall, so
 that an over-confidence is seen whenever it begins (E. S. Page, "Continuous inspection schemes", Biometrika
-41, 1954). With :data:`ALARM` for any scale, sigmas are taken as too small by the likeliest one; they are
-taken as reported again when half of that evidence is gone.
+41, 1954). Receivers of a formation are of one kind: what all of them but any one say together counts for
+each, so a fault of one alone is told of that one only. With :data:`ALARM` for any scale, sigmas are taken as
+too small by the likeliest one; they are taken as reported again when half of that evidence is gone.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ class ScaleEvidence(Monitor):
         super().__init__(runs, uavs)
         self._degrees, self._axes = degrees, axes
         self._odds = np.zeros((runs, uavs, len(SCALES)))
+        self._without = np.zeros((runs, uavs, len(SCALES)))
 
     def observe(self, off: Array, variance: Array, sigma: Array, weight: Array, time_s: float) -> Array:
         """Take in one epoch and return by how much each scale changes.
@@ -76,12 +78,12 @@ class ScaleEvidence(Monitor):
         told = np.where((sigma > 0.0) & (sigma < np.inf) & self._axes, sigma, np.nan)[..., None]
         says = self._log_density(off, variance, told * SCALES) - self._log_density(off, variance, told)
         said = np.where(np.isfinite(says), weight[..., None] * says, 0.0)
-        odds = self._odds + said[:, :, 0] + said[:, :, 1] + said[:, :, 2]
-        # Not much more than an alarm takes is kept, or an honest sigma would be long in being believed again.
-        odds -= np.maximum(odds.max(axis=-1, keepdims=True) - 2.0 * ALARM, 0.0)
-        self._odds = np.maximum(odds, 0.0)
-        best, before = self._odds.max(axis=-1), self.scale.max(axis=-1)
-        wanted = SCALES[self._odds.argmax(axis=-1)] ** 2
+        own = said[:, :, 0] + said[:, :, 1] + said[:, :, 2]
+        self._odds = _weighed(self._odds + own)
+        self._without = _weighed(self._without + own.sum(axis=1, keepdims=True) - own)
+        odds = np.maximum(self._odds, self._without.min(axis=1, keepdims=True))
+        best, before = odds.max(axis=-1), self.scale.max(axis=-1)
+        wanted = SCALES[odds.argmax(axis=-1)] ** 2
         # A step of SCALES down and up again is no news.
         wanted = np.where((wanted < before) & (wanted > before / 4.0), before, wanted)
         scale = np.where(best >= np.where(before > 1.0, 0.5 * ALARM, ALARM), wanted, 1.0)
@@ -97,3 +99,11 @@ class ScaleEvidence(Monitor):
         with np.errstate(invalid="ignore", divide="ignore"):
             tail = np.log1p(off[..., None] ** 2 / (self._degrees * square))
             return np.asarray(-0.5 * (np.log(square) + (self._degrees + 1.0) * tail))
+
+
+def _weighed(odds: Array) -> Array:
+    """Keep log-odds (..., scale) from none to what an alarm takes twice.
+
+    Were more kept, an honest sigma would be long in being believed again.
+    """
+    return np.asarray(np.maximum(odds - np.maximum(odds.max(axis=-1, keepdims=True) - 2.0 * ALARM, 0.0), 0.0))

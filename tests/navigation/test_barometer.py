@@ -160,6 +160,32 @@ def test_the_kalman_filter_with_an_offset_is_one_of_five_states() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_the_covariance_stays_one_for_long(name: str) -> None:
+    """Half an hour of epochs, sigmas of fixes from a millimetre to 50 m, outages of minutes: five by five."""
+    of, random = model(**OPEN), np.random.default_rng(21)
+    mine, lowest = filter_of(name, of, 1, 3.0), np.inf
+    upper, full = np.triu_indices(4), np.empty((5, 5))
+    for epoch in range(20_000):
+        if epoch:
+            mine.predict(np.zeros((1, 1, 3)), ACTIVE)
+        mine.take_in_heights(0.1 * random.standard_normal((1, 1)), ACTIVE)
+        sigma = 10.0 ** random.uniform(-3.0, 1.7)
+        mine.correct(
+            sigma * random.standard_normal((1, 1, 3)), 0.1 * random.standard_normal((1, 1, 3)),
+            sigma**2 * np.eye(3)[None, None], np.array([[epoch % 4000 < 3000]]), True, ACTIVE,
+        )  # fmt: skip
+        full[upper] = full.T[upper] = mine._packed[0, 0, 2]
+        full[4, :4] = full[:4, 4] = mine._offset[0, 0, 1:5]
+        full[4, 4] = mine._offset[0, 0, 5]
+        kept = [0, 1, 2, 3, 4] if name == "kalman" else [0, 1, 3, 4]  # the point-mass filter has no state g
+        part = full[np.ix_(kept, kept)]
+        scale = np.sqrt(np.diag(part))
+        assert (scale > 0.0).all(), epoch
+        lowest = min(lowest, np.linalg.eigvalsh(part / np.outer(scale, scale)).min())
+    assert lowest > -1e-12
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_heights_are_as_certain_as_told_with_fixes_and_without(name: str) -> None:
     """400 UAVs in a world of the assumed laws: a minute of fixes, a minute without, ten seconds of fixes."""
     flight = Flight(name, model(**OPEN), 400, 7)

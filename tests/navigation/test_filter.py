@@ -251,7 +251,7 @@ def test_the_covariance_stays_positive_over_100_000_ticks() -> None:
                 mean, packed, 3.0 * sigma * rng.normal(size=3), 0.1 * rng.normal(size=(1, 1, 3)), sigma,
                 there, never, memory, 1.0 - memory**2, 1e-6, 0.01, 2.5e-3, 0.0, there & False,
                 there & False, there & False, False, np.array([[tick == 0]]),
-                active, verdict, none, none[..., 0],
+                active, verdict, none, none[..., 0], np.empty((0, 1, 6)), math.nan,
             )  # fmt: skip
             full[:, upper[0], upper[1]] = packed[0, 0]
             full[:, upper[1], upper[0]] = packed[0, 0]
