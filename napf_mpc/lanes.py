@@ -77,7 +77,8 @@ def navigate(
     every_s : float
         Time between two moments that are kept, at least a tick of the inner loop [s].
     outage_s : (float, float), optional
-        From when to when nobody has a fix [s].
+        From when to when nobody has a fix, behind a filter, which begins by the one carried on to t = 0 all
+        the same [s].
     data_folder : path, optional
         Of real data.
 
@@ -91,7 +92,8 @@ def navigate(
     NapfError
         If the scene cannot be built or a data file is missing.
     ValueError
-        If ``seconds`` is not above 0 and within ``simulation.time_limit_s``, or ``every_s`` not above 0.
+        If ``seconds`` is not above 0 and within ``simulation.time_limit_s``, ``every_s`` not above 0, or
+        ``outage_s`` no time, or of navigation without a filter.
     """
     mission = formation_mission(problem)
     frame, offsets = PathFrame.of_mission(mission), formation_offsets(problem.formation)
@@ -107,10 +109,15 @@ def navigate(
             f"seconds = {seconds:g}, every_s = {every_s:g}: need 0 < seconds <= simulation.time_limit_s = "
             f"{limit_s:g}, as far as errors are drawn, and every_s > 0"
         )
+    settings = problem.navigation
+    if outage_s is not None and not (0.0 <= outage_s[0] < outage_s[1] and settings.filter != "none"):
+        raise ValueError(
+            f"outage_s = {outage_s[0]:g}, {outage_s[1]:g} behind navigation.filter = "
+            f'"{settings.filter}": need 0 <= first < last, and a filter, which is what goes on without fixes'
+        )
     ahead = frame.to_world(np.array([[1.0, 0.0, 0.0]])) - frame.to_world(np.zeros((1, 3)))
     velocity = np.broadcast_to(pace * ahead, (len(runs), len(offsets), 3))
     still, active = np.zeros(velocity.shape), np.ones(len(runs), dtype=np.bool_)
-    settings = problem.navigation
     fixes: FixSource = fixes_of_flight(errors)
     if outage_s is not None:
         first, last = (round(moment / errors.period_s) for moment in outage_s)

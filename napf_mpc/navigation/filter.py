@@ -90,7 +90,7 @@ class KalmanFilter:
         self._barred = np.zeros((runs, uavs), dtype=np.bool_)
         self._last_position = np.full((runs, uavs, 3), np.nan)
         self._epoch = 0
-        self._offset = np.empty((runs if model.barometer else 0, uavs, height_offset.NUMBERS))
+        self._offset = np.full((runs if model.barometer else 0, uavs, height_offset.NUMBERS), np.nan)
 
         shared = bool(model.common_share.any()) and 1 < uavs <= cross_covariance.MAX_UAVS
         kept = runs if shared or model.coupled else 0
@@ -160,8 +160,8 @@ class KalmanFilter:
         model = self._model
         assert model.barometer is not None
         height_offset.take_in_heights(
-            self._mean, self._packed, self._offset, height, model.barometer.noise, model.barometer.offset,
-            model.gate, self._record.begun, active,
+            self._mean, self._packed, self._offset, height, model.barometer.noise, model.gate,
+            self._record.begun, active,
         )  # fmt: skip
 
     def correct(
@@ -284,10 +284,9 @@ class KalmanFilter:
         self._follows = np.isfinite(self._refused_miss).all(-1) & ~stepped & ~calm
         change = monitor.observe(squared, time_s)
         if (change != 1.0).any():
+            root = np.maximum(np.sqrt(change[..., height_offset.VERTICAL]), 1.0)
+            height_offset.follow_alarm(self._packed, self._offset, root)
             kalman.rescale(self._mean, self._packed, change)
-            if len(self._offset):
-                grown = np.maximum(np.sqrt(change[..., height_offset.VERTICAL]), 1.0)
-                self._offset[..., height_offset.OP] *= grown
         if (monitor.scale == 1.0).all():
             return sigma, covariance
         root = np.sqrt(monitor.scale)

@@ -148,8 +148,9 @@ class FilteredNavigation:
         found = self._filter.solution(time_s, attitude.copy(), body_rates.copy())
         if self._lasting is not None:
             lasting = self._lasting
-            if self.monitor is not None:
+            if isinstance(self._filter, PointMassFilter) and self.monitor is not None:
                 # A receiver that believes too much of its own errors does so of what it shares with others.
+                # The Kalman filter's monitor scales by single disagreements too, which say nothing of these.
                 lasting = lasting * np.sqrt(self.monitor.scale)[..., None]
             found = _with_lasting(found, lasting)
         # A protection level is one of the fix, and says nothing of an estimate: it ends here.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled, compiled_bare
 
-__all__ = ["NUMBERS", "VERTICAL", "begin", "carry", "follow", "learn", "shift", "take_in_heights"]
+__all__ = ["NUMBERS", "VERTICAL", "begin", "carry", "follow", "follow_alarm", "learn", "take_in_heights"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,17 +27,18 @@ VERTICAL = 2
 
 @compiled_bare
 def begin(offset: Array, variance: float) -> None:
-    """Know nothing of an offset but the variance of its law [m^2]."""
+    """Know nothing of an offset but the variance of its law [m^2]; infinite: nothing at all."""
     offset[:] = 0.0
     offset[OO] = variance
 
 
 @compiled_bare
-def shift(offset: Array, by: float, variance: float) -> None:
-    """Take in that the height was another all the time, so that the offset is off by as much [m]."""
-    mean = offset[MEAN] + by
-    begin(offset, variance)
-    offset[MEAN] = mean
+def _tell(offset: Array, x: Array, c: Array, height: float, noise: float) -> None:
+    """Take an offset of which nothing is known from one height: what the position is off, it is off too."""
+    offset[MEAN] = height - x[0]
+    for n in range(4):
+        offset[OP + n] = -c[n]
+    offset[OO] = c[0] + noise
 
 
 @compiled_bare
@@ -51,32 +52,55 @@ def learn(offset: Array, k: Array, h_p: float, h_v: float, h_g: float, spread: f
 
 
 @compiled_bare
-def follow(offset: Array, pv: float, pb: float, prior: float, left: float, moved: float) -> None:
-    """Take in that the position alone moved, and that its variance is a part of what it was.
+def follow(offset: Array, pp: float, pv: float, pg: float, pb: float, c: Array, moved: float) -> None:
+    """Take in that what is known of the position changed, and nothing else.
 
-    Velocity and bias were not moved with it; the offset is, by what it had in common with the position.
+    The other states did not follow; the offset does, as far as its error is the position's: by
+    :math:`P_{op} / P_{pp}` of what that changed, whether less is known now or more.
 
     Parameters
     ----------
     offset : array, shape (6,)
         Overwritten.
-    pv, pb : float
-        What the position had in common with velocity and bias.
-    prior : float
-        Variance of the position before [m^2].
-    left : float
-        Part of it that is left.
+    pp, pv, pg, pb : float
+        Variance of the position before, and what it had in common with the other states.
+    c : array, shape (10,)
+        Covariance of the states now.
     moved : float
-        How far the position moved [m].
+        How far the estimate of the position moved [m].
     """
-    if prior <= 0.0:
+    if pp <= 0.0:
         return
-    rate = offset[OP] / prior
+    rate = offset[OP] / pp
     offset[MEAN] += rate * moved
-    offset[OO] -= rate * (1.0 - left) * offset[OP]
-    offset[OV] -= rate * (1.0 - left) * pv
-    offset[OB] -= rate * (1.0 - left) * pb
-    offset[OP] *= left
+    offset[OO] += rate * rate * (c[0] - pp)
+    offset[OP] = rate * c[0]
+    offset[OV] += rate * (c[1] - pv)
+    offset[OG] += rate * (c[2] - pg)
+    offset[OB] += rate * (c[3] - pb)
+
+
+@compiled
+def follow_alarm(packed: Array, offset: Array, root: Array) -> None:
+    """Let offsets follow positions that turn out less certain, before these are told so, in place.
+
+    Parameters
+    ----------
+    packed, offset : array, shape (run, uav, 3, 10) and (run, uav, 6)
+        Covariances before; offsets are overwritten.
+    root : array, shape (run, uav)
+        Factor on the sigma of the height, and on what it has in common with the other states; at least 1.
+    """
+    after = np.empty(4)
+    for r in range(offset.shape[0]):
+        for i in range(offset.shape[1]):
+            if root[r, i] == 1.0:
+                continue
+            c = packed[r, i, VERTICAL]
+            for n in range(4):
+                after[n] = root[r, i] * c[n]
+            after[0] *= root[r, i]
+            follow(offset[r, i], c[0], c[1], c[2], c[3], after, 0.0)
 
 
 @compiled
@@ -112,15 +136,14 @@ def take_in_heights(
     offset: Array,
     height: Array,
     noise: float,
-    variance: float,
     gate: float,
     begun: Mask,
     active: Mask,
 ) -> None:
     """Update the vertical axes with one height each, in place.
 
-    A height that leaps, farther than ``gate`` of its sigmas from what is expected, is one with a new offset:
-    what was known of the old one is forgotten. One that is not finite is none.
+    A height that leaps, farther than ``gate`` of its sigmas from what is expected, is one with a new offset,
+    of which it alone tells. One that is not finite is none.
 
     Parameters
     ----------
@@ -130,8 +153,8 @@ def take_in_heights(
         Overwritten.
     height : array, shape (run, uav)
         Measured [m].
-    noise, variance : float
-        Variances of the white noise, and of an offset of which nothing is known [m^2].
+    noise : float
+        Variance of the white noise [m^2].
     gate : float
         Largest innovation in its sigmas; 0 for none.
     begun : array of bool, shape (run, uav)
@@ -149,13 +172,9 @@ def take_in_heights(
             x, c, o = mean[r, i, VERTICAL], packed[r, i, VERTICAL], offset[r, i]
             miss = height[r, i] - x[0] - o[MEAN]
             spread = c[0] + 2.0 * o[OP] + o[OO] + noise
-            if gate > 0.0 and miss * miss > gate * gate * spread:
-                begin(o, variance)
-                miss, spread = height[r, i] - x[0], c[0] + variance + noise
-                if miss * miss > gate * gate * spread:
-                    # Farther than any offset: taken as it is, so that the next heights can be told from it.
-                    shift(o, miss, variance)
-                    miss = 0.0
+            if o[OO] == np.inf or (gate > 0.0 and miss * miss > gate * gate * spread):
+                _tell(o, x, c, height[r, i], noise)
+                continue
             for n in range(4):
                 seen[n] = c[n] + o[OP + n]
             own = o[OP] + o[OO]

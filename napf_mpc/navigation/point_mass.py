@@ -191,16 +191,16 @@ def correct(
                     if _is_elsewhere(astray[r, i, a], grid, off, sigma, degrees, weight):
                         _lay(x, c, p, grid, place, sigma, degrees)
                         if tied:
-                            height_offset.shift(offset[r, i], -off, offset_variance)
+                            height_offset.begin(offset[r, i], np.inf)
                         outvoted = False
                         continue
                     _sharpen(p, spare, grid, off, sigma, degrees, weight)
                     _weigh(p, off - grid[CENTRE], grid[STEP], sigma, degrees, weight)
-                    pv, pb = c[1], c[3]
+                    # Heights may know more than the density, so what the offset follows is the covariance.
+                    pp, pv, pb = c[0], c[1], c[3]
                     moved = _settle(x, c, p, grid, prior)
                     if tied:
-                        left = min(c[0] / prior, 1.0)
-                        height_offset.follow(offset[r, i], pv, pb, prior, left, moved)
+                        height_offset.follow(offset[r, i], pp, pv, 0.0, pb, c, moved)
                     astray[r, i, a, PLACE] -= moved
                     _fit_grid(p, spare, grid, c[0])
             if outvoted:

@@ -73,9 +73,10 @@ class PointMassFilter:
         self._epoch = 0
         self.monitor: ScaleEvidence | None = None
         """What watches the innovations; None if nothing does."""
+        self._unseen = np.zeros(shape)
         if model.monitored:
             self.monitor = ScaleEvidence(degrees, ~model.fixless_axis, runs, uavs)
-        self._offset = np.empty((runs if model.barometer else 0, uavs, height_offset.NUMBERS))
+        self._offset = np.full((runs if model.barometer else 0, uavs, height_offset.NUMBERS), np.nan)
         self._forecast = replace(
             model.forecast(), error_memory=np.where(model.fixless_axis, model.error_memory, 0.0)
         )
@@ -113,8 +114,8 @@ class PointMassFilter:
         model = self._model
         assert model.barometer is not None
         height_offset.take_in_heights(
-            self._mean, self._packed, self._offset, height, model.barometer.noise, model.barometer.offset,
-            model.gate, self._record.begun, active,
+            self._mean, self._packed, self._offset, height, model.barometer.noise, model.gate,
+            self._record.begun, active,
         )  # fmt: skip
 
     def correct(
@@ -174,17 +175,19 @@ class PointMassFilter:
         """Sigmas (run, uav, 3) as the monitor makes them believable."""
         assert self.monitor is not None
         off = np.where(fresh[..., None], position - self._mean[..., 0], np.nan)
-        weight = np.tanh(0.5 * (self._lag + change))
+        # Since the last one looked at: a fix that is refused for its velocity is no less like the one before.
+        self._unseen += change
+        weight = np.tanh(0.5 * self._unseen)
+        self._unseen[np.isfinite(off)] = 0.0
         epoch_s = self._model.period_s * self._model.ticks_per_epoch
         grown = self.monitor.observe(off, self._packed[..., 0], sigma, weight, self._epoch * epoch_s)
         if (grown > 1.0).any():
             # What was made of the fixes so far is as uncertain as they are; the density follows its variance.
             root = np.sqrt(np.maximum(grown, 1.0))
+            height_offset.follow_alarm(self._packed, self._offset, root[..., height_offset.VERTICAL])
             self._packed[..., 0] *= root * root
             self._packed[..., 1] *= root
             self._packed[..., 3] *= root
-            if len(self._offset):
-                self._offset[..., height_offset.OP] *= root[..., height_offset.VERTICAL]
         return np.asarray(sigma * np.sqrt(self.monitor.scale))
 
     def _change(self) -> Array:

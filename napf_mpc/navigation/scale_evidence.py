@@ -13,7 +13,7 @@ measures is taken together: one that believes too much does so on all of them. B
 that an over-confidence is seen whenever it begins (E. S. Page, "Continuous inspection schemes", Biometrika
 41, 1954). Receivers of a formation are of one kind: what all of them but any one say together counts for
 each, so a fault of one alone is told of that one only. With :data:`ALARM` for any scale, sigmas are taken as
-too small by the likeliest one; they are taken as reported again when half of that evidence is gone.
+too small by the likeliest one; they are taken as reported again when less than half of that is left.
 """
 
 from __future__ import annotations

@@ -33,8 +33,9 @@ class Descent:
     mission's lanes. Stopped, it hovers until the hold is over.
 
     A sigma is that of the last solution that was trusted, or the one reported since if that is larger. Where
-    none ever was trusted, nothing says what is below, and nobody goes down. k is the problem's, also for
-    ``apf``: its fixed safety distance is for UAVs that know where they are.
+    none ever was trusted, nothing says what is below, and nobody goes down; so it is with margins from
+    protection levels where there is no level, since the place that is held then follows the fix. k is the
+    problem's, also for ``apf``: its fixed safety distance is for UAVs that know where they are.
 
     Parameters
     ----------
@@ -50,6 +51,7 @@ class Descent:
         self._step_m = DESCENT_MPS / settings.rate_hz
         self._k = Inflation.of_problem(problem).k
         self._radius_m = problem.vehicle.radius_m
+        self._by_levels = settings.safety == "protection_level"
         self._ground_m = ground_m(problem)
         self._floor_m = -math.inf if settings.altitude_m is None else settings.altitude_m[0]
         if self._ground_m == -math.inf:
@@ -69,6 +71,12 @@ class Descent:
     def note(self, nav: NavSolution, trusted: Mask) -> None:
         """Note sigmas in the plane and up; without trust (run, uav) they never shrink."""
         _note(plain(nav.covariance), trusted, self._sigma)
+        if self._by_levels:
+            self._sigma[~trusted] = np.inf
+
+    def release(self) -> None:
+        """Nobody holds any more."""
+        self._since_s.fill(np.nan)
 
     def lower(self, time_s: float, holding: Mask, place: Array) -> Mask:
         """Lower the places of who has held for long.
@@ -89,7 +97,7 @@ class Descent:
         """
         down = np.zeros(holding.shape, dtype=np.bool_)
         if not holding.any():
-            self._since_s.fill(np.nan)
+            self.release()
             return down
         lowest, highest = self._obstacles.boxes
         _lower(
@@ -121,6 +129,8 @@ def _note(covariance: Array, trusted: Mask, sigma: Array) -> None:
             plane = 0.5 * (c[0, 0] + c[1, 1]) + math.sqrt(skew * skew + both * both)
             for n in range(2):
                 variance = plane if n == 0 else c[2, 2]
+                if math.isinf(c[0, 0]) or math.isinf(c[1, 1]):
+                    variance = c[2, 2] if n == 1 else math.inf
                 # What is no variance, NaN included, is not larger than what was known.
                 found = math.sqrt(variance) if variance > 0.0 else 0.0
                 if trusted[run, uav] or found > sigma[run, uav, n]:
@@ -162,5 +172,5 @@ def _lower(
             if z > stop:
                 place[run, uav, 2] = max(z - step_m, stop)
                 down[run, uav] = True
-            else:
+            elif stop < np.inf:
                 since_s[run, uav] = np.inf

@@ -2,9 +2,9 @@ r"""What a poor sky costs on a guide: the squared error that a fix is expected t
 
 The squared distance of a UAV from its lane is that of its guide and the squared error of its position
 together, so a variance is priced as a squared offset is, times a weight. What it has more or less than on the
-lane counts in full while that is little and is bounded where it is large, :func:`bounded`: no sky outbids a
-margin, and what there is to gain beside the lane does not depend on what is far away. What all of a station
-has in common cannot be chosen: its best place is free.
+lane counts in full while that is little and is bounded where it is large, :func:`bounded`: metre for metre no
+sky outbids a margin, and what there is to gain beside the lane does not depend on what is far away. What all
+of a station has in common cannot be chosen: its best place is free.
 
 Prices are tables over the lattice of :mod:`.guide_lattice`, linear in between. Nothing in here is asked
 without a weight.

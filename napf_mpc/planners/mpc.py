@@ -472,7 +472,7 @@ class QpPlanner:
         )  # fmt: skip
         if causes is None:
             self._made_s[:] = time_s
-            self._descent.lower(time_s, ~accepted, self._anchor)
+            self._descent.release()
             return new, self.ladder.all_accepted()
         still = standing_plan(self.problem.vehicle, self._yaw, time_s, step_s, self._anchor)
         # Without navigation nothing tells whether the tail is followed; upset, it cannot be.

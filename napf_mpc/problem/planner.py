@@ -63,7 +63,7 @@ class Planner(Section):
     altitude_m: tuple[Coordinate, Coordinate] | None = None
     """QP planner: least and largest height to fly at; none by default."""
     descend_after_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = 30.0
-    """A UAV that has held its place for this long for want of navigation, or of a plan, goes down at 0.5 m/s until something may be near below (docs/navigation.md); null to hold for ever."""  # noqa: E501
+    """A UAV that has held its place for this long for want of navigation, or of a plan, goes down at 0.5 m/s until something may be near below (docs/navigation.md); null, or a time longer than the mission, to hold for ever."""  # noqa: E501
     influence_scale: float = Field(0.01, ge=1e-9, le=1e6)
     """QP planner: price per metre and second for each m/s of NAPF's repulsion."""
     k: Annotated[float, Field(ge=0.0, le=20.0)] | None = None

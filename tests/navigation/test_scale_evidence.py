@@ -210,7 +210,28 @@ def test_an_alarm_makes_uncertain_what_came_of_the_fixes(
     factors = np.ones(10)
     factors[[0, 1, 3]] = root**2, root, root
     np.testing.assert_allclose(watched._packed, before * factors, rtol=1e-12)
-    np.testing.assert_allclose(watched._offset, offset * [1.0, root, 1.0, 1.0, 1.0, 1.0], rtol=1e-12)
+    c, rate = before[0, 0, 2], offset[0, 0, 1] / before[0, 0, 2, 0]
+    more = [0.0, root**2 * offset[0, 0, 1] - offset[0, 0, 1], rate * (root - 1.0) * c[1], 0.0]
+    more += [rate * (root - 1.0) * c[3], rate**2 * (root**2 - 1.0) * c[0]]
+    np.testing.assert_allclose(watched._offset[0, 0], offset[0, 0] + more, rtol=1e-12, atol=1e-15)
+
+
+def test_refused_fixes_do_not_count_for_more_than_others() -> None:
+    """A reflection of 30 m for 2.9 s, on one axis, whose velocity is refused: few take it for a scale."""
+    keys = {"filter": "point_mass", "filter_correlation_time_s": 2.0, "monitor": "innovations"}
+    model = FilterModel.of_navigation(GaussMarkov.model_validate(keys), 0.1, 1)
+    watched, active, shape = PointMassFilter(model, 3.0, 100, 1), np.ones(100, dtype=bool), (100, 1, 3)
+    for epoch, position in enumerate(errors(1.0, 300, 2.0, 18)):
+        if epoch:
+            watched.predict(np.zeros(shape), active)
+        wrong = 150 <= epoch < 179
+        watched.correct(
+            position + np.array([30.0, 0.0, 0.0]) * wrong, np.full(shape, 3.0 * wrong),
+            np.tile(9.0 * np.eye(3), (100, 1, 1, 1)), np.ones((100, 1), dtype=bool), True, active,
+        )  # fmt: skip
+    assert watched.monitor is not None
+    assert (watched.refused_fixes >= 29).all()
+    assert (watched.monitor.alarms > 0).mean() < 0.05
 
 
 def test_flagged_in_the_street_and_in_its_results() -> None:

@@ -244,7 +244,7 @@ def test_a_low_wall_is_climbed_as_without_a_price_and_farther_on_the_open_side()
     assert left[1] < -2.0 < left[0]
 
 
-def test_no_sky_outbids_a_breach_that_counts_as_blocked() -> None:
+def test_metre_for_metre_no_sky_outbids_a_breach_that_counts_as_blocked() -> None:
     """From no fix at all to the best fix there is: the price of 0.2 m of breach."""
     squares = np.where(LEFTS > 0.0, np.inf, np.where(LEFTS < 0.0, 0.0, 150.0))
     prices = prices_of(10.0)
