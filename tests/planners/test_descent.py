@@ -395,3 +395,41 @@ def test_an_outage_of_a_minute_over_a_wood_ends_well(
     assert not score.obstacle_contact.any()
     assert not score.uav_contact.any()
     assert score.finished.all()
+
+
+@pytest.mark.parametrize("variance", [1e300, np.inf])
+def test_who_is_lost_in_the_plane_stays_however_that_is_told(variance: float) -> None:
+    """Both sigmas of the plane beyond all bounds: something high stands within them, or nothing is known."""
+    planner = make_planner("napf", problem())
+    nav = solution(fix=False)
+    covariance = nav.covariance.copy()
+    covariance[..., [0, 1], [0, 1]] = variance
+    roof = ObstacleSet.from_shapes([Box((10.0, 15.0, 40.0), (4.0, 4.0, 80.0))])
+    commands = lost(planner, roof, replace(nav, covariance=covariance), 205.0)
+    assert heights(commands)[-1] >= 80.0
+
+
+def test_the_timer_of_who_was_lost_and_then_had_no_plan_goes_on() -> None:
+    """Due while its sigma was infinite, and then it is known where it is: it goes down after all."""
+    descent = Descent(problem())
+    descent.reset(ObstacleSet.empty(), 1, 1)
+    place, holds = np.array([[PLACE]]), np.ones((1, 1), dtype=bool)
+    for n in range(50):  # never trusted so far
+        assert not descent.lower(0.1 * n, holds, place).any()
+    descent.note(solution(), holds)
+    assert descent.lower(5.0, holds, place).all()
+
+
+@pytest.mark.parametrize("name", ["napf", "qp"])
+def test_without_a_level_nobody_goes_down(name: str) -> None:
+    """The last level held over a roof; the fix without one is 40 m aside, over the street, or so it says."""
+    settings = problem(safety="protection_level").model_dump(mode="python")
+    settings["navigation"] = {"kind": "gnss", "integrity": "araim"}
+    planner = make_planner(name, Problem.model_validate(settings))
+    roof = ObstacleSet.from_shapes([Box((10.0, 0.0, 20.0), (10.0, 10.0, 40.0))])
+    known = replace(solution(), protection=np.full((1, 1, 2), 2.0))
+    planner.reset(roof, 1)
+    planner.step(known, 0.0)
+    aside = replace(solution([[(50.0, 0.0, 100.0)]]), protection=np.full((1, 1, 2), np.nan))
+    commands = [planner.step(aside, 0.1 * n) for n in range(1, 500)]
+    assert (heights(commands) == 100.0).all()
