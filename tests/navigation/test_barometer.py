@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from napf_mpc.block import fly_block
 from napf_mpc.errors import ProblemError
 from napf_mpc.lanes import navigate
-from napf_mpc.navigation import kalman
+from napf_mpc.navigation import height_offset, kalman
 from napf_mpc.navigation.filter import KalmanFilter
 from napf_mpc.navigation.filter_model import BarometerModel, FilterModel
 from napf_mpc.navigation.point_mass_filter import PointMassFilter
@@ -190,6 +190,27 @@ def test_the_covariance_stays_one_for_long(name: str) -> None:
         assert (scale > 0.0).all(), epoch
         lowest = min(lowest, np.linalg.eigvalsh(part / np.outer(scale, scale)).min())
     assert lowest > -1e-12
+
+
+def test_an_alarm_is_a_transformation_of_all_five_errors() -> None:
+    """The position's error grows by the root, and the offset's by its part in that, in any covariance."""
+    random = np.random.default_rng(22)
+    packed, offset, root = np.empty((2, 3, 3, 10)), np.empty((2, 3, 6)), random.uniform(1.5, 6.0, (2, 3))
+    root[1, 2] = 1.0
+    upper, expected = np.triu_indices(4), np.empty((2, 3, 5))
+    for at in np.ndindex(2, 3):
+        half = random.standard_normal((5, 7))
+        p = half @ half.T
+        packed[at] = p[upper]
+        offset[at] = random.standard_normal(), *p[4]
+        t = np.eye(5)
+        t[0, 0] = root[at]
+        t[4, 0] = p[4, 0] / p[0, 0] * (root[at] - 1.0)
+        expected[at] = (t @ p @ t.T)[4]
+    means = offset[..., 0].copy()
+    height_offset.follow_alarm(packed, offset, root)
+    np.testing.assert_allclose(offset[..., 1:], expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(offset[..., 0], means)
 
 
 @pytest.mark.parametrize("name", NAMES)
