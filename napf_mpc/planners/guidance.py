@@ -26,6 +26,7 @@ from napf_mpc.planners.guide_search import plan_all, resample_all
 from napf_mpc.planners.guide_settings import FINE, GuidanceSettings, search_of
 from napf_mpc.planners.guide_sky import NO_SKY, SkyField, sky_field
 from napf_mpc.planners.guide_traffic import TrafficPace, slowed
+from napf_mpc.planners.sigma_memory import SigmaMemory
 from napf_mpc.planners.taut import pulled_taut
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.safety_distance import Inflation, rms_sigma
@@ -122,7 +123,7 @@ class Guidance:
         self._planned_at = np.zeros((runs, uavs))
         self._position = np.repeat(self._path.to_world(self._slots)[None], runs, axis=0)
         self._covariance = np.tile(np.eye(3), (runs, uavs, 1, 1))
-        self._peak: Array = np.zeros((runs, uavs, 3))
+        self._memory = SigmaMemory(runs, uavs, self.settings.memory_s)
         self._next_s = -np.inf
         self._last_s = np.nan
         self._holding = np.zeros(runs, dtype=bool)
@@ -143,6 +144,7 @@ class Guidance:
         taut: bool = False,
         flying: NDArray[np.bool_] | None = None,
         sigma_map: SigmaMap | None = None,
+        measured: bool = False,
     ) -> Guide:
         """Guide from what navigation reports; plans anew when its period has passed.
 
@@ -164,6 +166,9 @@ class Guidance:
             Runs that still fly; the others keep the plans they have.
         sigma_map : SigmaMap, optional
             Where fixes will be good; read only with ``planner.open_sky_weight``.
+        measured : bool
+            Whether the covariance is that of raw measurements, which says nothing of later ones: then room is
+            left for what it was in the last seconds, too, see :mod:`.sigma_memory`.
 
         Returns
         -------
@@ -178,7 +183,8 @@ class Guidance:
         if due:
             self._look_up(sigma_map)
             elapsed = 0.0 if np.isnan(self._last_s) else time_s - self._last_s
-            self._plan(place, elapsed, taut, ~self._given_up if flying is None else flying & ~self._given_up)
+            asked = ~self._given_up if flying is None else flying & ~self._given_up
+            self._plan(place, elapsed, taut, measured, asked)
             self._last_s = time_s
             self._next_s = time_s + self.settings.period_s
         guide = self._guide(along)
@@ -208,13 +214,17 @@ class Guidance:
             assert np.array_equal(sigma_map.frame.origin, self._path.origin)
             self._sky = sky_field(sigma_map)
 
-    def _plan(self, place: Array, elapsed_s: float, taut: bool, asked: NDArray[np.bool_]) -> None:
+    def _plan(
+        self, place: Array, elapsed_s: float, taut: bool, measured: bool, asked: NDArray[np.bool_]
+    ) -> None:
         # Stations stand still in the world: a gap must not open and close with where the samples fall.
         step = self.settings.step_m
         along = np.floor(place[..., 0] / step) * step
         last = self._from(self._profiles, along)
         offset = np.ascontiguousarray(place[..., 1:]) - self._lanes
-        margin = self._margin_covariance(elapsed_s)
+        margin = np.ascontiguousarray(self._inflation.margin_covariance(self._covariance))
+        if measured:
+            margin = self._memory.raised(margin, elapsed_s)
         plan_all(
             self._obstacles.solids,
             self._boxes,
@@ -245,16 +255,6 @@ class Guidance:
             )  # fmt: skip
             self._taut = np.concatenate([pulled, loose[..., None]], axis=-1)
         self._hold(offset, elapsed_s)
-
-    def _margin_covariance(self, elapsed_s: float) -> Array:
-        """Covariance (run, uav, 3, 3) whose k sigma is the margin, as the inflation reads it."""
-        covariance = self._inflation.margin_covariance(self._covariance)
-        if self.settings.memory_s <= 0.0:
-            return np.ascontiguousarray(covariance)
-        sigma = np.sqrt(np.einsum("...ii->...i", covariance))
-        self._peak = np.maximum(sigma, self._peak * np.exp(-elapsed_s / self.settings.memory_s))
-        grown = self._peak / np.maximum(sigma, 1e-12)
-        return np.asarray(covariance * grown[..., :, None] * grown[..., None, :])
 
     def _separation(self, covariance: Array) -> Array:
         """Distances (run, uav, uav) to keep between UAVs: k sigma of both, as far as slots allow."""

@@ -108,8 +108,8 @@ class GuidanceSettings:
     """A UAV this far off its guide is waited for while the others hold [m]."""
     hold_limit_s: float = 40.0
     """A hold of this length is the end: no passage [s]."""
-    memory_s: float = 0.0
-    """Time constant with which sigmas seen before are forgotten; 0 plans with the present ones [s]."""
+    memory_s: float = 15.0
+    """Time constant with which the mean of raw measurements' sigmas forgets [s]."""
     left_behind_m: float = 3.0
     """A UAV this far behind its slot, with two sigma to that, is waited for [m]."""
 

@@ -76,8 +76,9 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         room = guidance_covariance(nav, trusted, ahead)
         flying = None if nav.airborne is None else np.asarray(nav.airborne.any(-1))
         guide = self.guidance.step(
-            position, room, trusted, time_s, nav.tracks, flying=flying, sigma_map=nav.sigma_map
-        )
+            position, room, trusted, time_s, nav.tracks, flying=flying, sigma_map=nav.sigma_map,
+            measured=not nav.filtered,
+        )  # fmt: skip
         self.guide = guide
         place = self._frame.to_path(position)
         error = synchronisation_error(place[..., 0], self._offsets[:, 0])

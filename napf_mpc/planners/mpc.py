@@ -57,8 +57,9 @@ STUCK_PART, STUCK_M = 0.3, 2.0
 """A plan that gets less than this part of its reference's way, if that is farther than this, is stuck."""
 REPULSION_PART = 0.5
 """NAPF's repulsion pulls with this part of the contact price at most: it never outbids the margin itself."""
-LEAVING_MPS = 2.0
-"""A UAV inside a margin is asked to leave it no faster than this."""
+LEAVING_MPS = 0.3
+"""A UAV inside a margin is asked to leave it no faster than this. It may never go deeper. Estimates wander in
+and out of margins: who leaves faster than errors fade flies after them."""
 SPEED_PRICE = (1000.0, 1000.0)
 """Prices of a speed slack: above what the margins can gain by it, so that no margin buys a dash."""
 _CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
@@ -239,7 +240,7 @@ class QpPlanner:
             flying = np.asarray(airborne.any(-1))
             guide = self._guidance.step(
                 state[..., POSITION], room, trusted, time_s, taut=nav.filtered, flying=flying,
-                sigma_map=nav.sigma_map,
+                sigma_map=nav.sigma_map, measured=not nav.filtered,
             )  # fmt: skip
         reference, way = self._references(state, carried, nav, covariance, trusted, guide)
         began = 0.0 if self._clock is None else self._clock()

@@ -127,6 +127,21 @@ def test_head_on_it_goes_round_one_side_with_its_margin_and_comes_back(shape: Sh
     assert max(np.abs(place[0, 1:] - SLOTS[0, 1:]).max() for place in places) < 1.5 + RADIUS + K_SIGMA + 1.0
 
 
+def test_measurements_that_were_worse_are_remembered_and_a_filters_forecast_is_believed() -> None:
+    """Sigma 2 m for eight seconds, then 0.5 m: the detour is for a mean of 1.8 m, or for 0.5 m."""
+    farthest = {}
+    for measured in (True, False):
+        made = guidance([Cylinder((40.0, 3.0), 1.0)])
+        everybody = np.ones((1, 4), dtype=bool)
+        for tick in range(21):
+            sigma = 2.0 if tick < 20 else 0.5
+            guide = made.step(SLOTS[None], isotropic(sigma), everybody, 0.4 * tick, measured=measured)
+        farthest[measured] = float(np.abs(guide.offset[0, 0, :, 0]).max())
+    mean = 2.0 - 1.5 * (1.0 - math.exp(-0.4 / SETTINGS.memory_s))
+    assert farthest[False] == pytest.approx(1.0 + RADIUS + 1.5, abs=1.2)
+    assert farthest[True] - farthest[False] == pytest.approx(3.0 * (mean - 0.5), abs=1.0)
+
+
 def test_margins_of_a_passage_let_it_pass_nearer_to_what_is_small_and_round() -> None:
     """An error of 2 m: three quarters of a wall's margin from a small ball, all of it from a post or box."""
     table = passage_margins(Inflation(3.0))
