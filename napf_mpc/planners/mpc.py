@@ -57,9 +57,9 @@ STUCK_PART, STUCK_M = 0.3, 2.0
 """A plan that gets less than this part of its reference's way, if that is farther than this, is stuck."""
 REPULSION_PART = 0.5
 """NAPF's repulsion pulls with this part of the contact price at most: it never outbids the margin itself."""
-LEAVING_MPS = 0.3
-"""A UAV inside a margin is asked to leave it no faster than this. It may never go deeper. Estimates wander in
-and out of margins: who leaves faster than errors fade flies after them."""
+LEAVING_MPS, LEAVING_RAW_MPS = 2.0, 0.3
+"""``planner.leaving_mps`` behind a filter, and on raw measurements. These wander in and out of margins by
+metres: who leaves faster than errors fade flies after them."""
 SPEED_PRICE = (1000.0, 1000.0)
 """Prices of a speed slack: above what the margins can gain by it, so that no margin buys a dash."""
 _CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
@@ -74,7 +74,9 @@ _NO_REASON = int(Reason.NONE)
 
 def default_constraints(problem: Problem) -> list[Constraint]:
     """Rows of the QP as a problem's settings ask for them."""
-    settings = problem.planner
+    settings, leaving = problem.planner, problem.planner.leaving_mps
+    if leaving is None:
+        leaving = LEAVING_RAW_MPS if problem.navigation.filter == "none" else LEAVING_MPS
     rows, price, margin = settings.obstacle_rows, settings.contact_price, settings.margin
     inflation = Inflation.of_problem(problem)
     contact = ObstacleContact(
@@ -83,7 +85,7 @@ def default_constraints(problem: Problem) -> list[Constraint]:
         w1=price,
         extra_m=settings.contact_extra_m,
         extra_sigmas=settings.contact_extra_sigmas,
-        opening_mps=LEAVING_MPS,
+        opening_mps=leaving,
         margin=margin,
     )
     most = REPULSION_PART * price if price > 0.0 else math.inf

@@ -42,13 +42,13 @@ class Planner(Section):
     """QP planner: nearest obstacles that each stage of each UAV keeps rows for, in each of two shells."""
     position_weight: float = Field(5.0, ge=1e-6, le=1e6)
     """QP planner: weight of the distance to the slot [1/(m^2 s)]."""
-    cohesion: float = Field(0.91, ge=0.0, le=0.95)
+    cohesion: float = Field(0.86, ge=0.0, le=0.95)
     """QP planner: share of the UAVs' mean sideways deviation that each is drawn along with."""
-    velocity_weight: float = Field(7.0, ge=0.0, le=1e6)
+    velocity_weight: float = Field(4.0, ge=0.0, le=1e6)
     """QP planner: weight of the velocity error [s/m^2]."""
-    attitude_weight: float = Field(3.0, ge=0.0, le=1e6)
+    attitude_weight: float = Field(1.0, ge=0.0, le=1e6)
     """QP planner: weight of roll, pitch and yaw error [1/(rad^2 s)]; a fifth of it on body rates."""
-    thrust_weight: float = Field(70.0, ge=1e-9, le=1e6)
+    thrust_weight: float = Field(80.0, ge=1e-9, le=1e6)
     """QP planner: weight of the thrust about hover [1/(N^2 s)]."""
     torque_weight: float = Field(600.0, ge=1e-9, le=1e6)
     """QP planner: weight of the torques [1/(N^2 m^2 s)]."""
@@ -60,6 +60,8 @@ class Planner(Section):
     """QP planner: distance kept from obstacles on top of the margin, at most."""
     contact_extra_sigmas: float = Field(0.95, ge=0.0, le=1e3)
     """QP planner: distance on top of the margin in sigmas; at most ``contact_extra_m``."""
+    leaving_mps: Annotated[float, Field(ge=1e-3, le=100.0)] | None = None
+    """QP planner: a UAV inside an obstacle's margin is asked to leave it no faster; by default 2 behind a filter, and 0.3 on raw measurements, which wander in and out of margins."""  # noqa: E501
     altitude_m: tuple[Coordinate, Coordinate] | None = None
     """QP planner: least and largest height to fly at; none by default."""
     descend_after_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = 30.0

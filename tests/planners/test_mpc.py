@@ -150,7 +150,7 @@ def test_the_repulsion_never_outbids_the_margin_it_is_for() -> None:
 
 def test_a_sigma_of_tens_of_metres_makes_no_lunge() -> None:
     """A wall 5 m beside, and a margin that has grown to 60 m: it is left within the limits."""
-    planner = QpPlanner(problem(), guided=False)
+    planner = QpPlanner(problem(planner={"kind": "qp", "leaving_mps": 2.0}), guided=False)
     _, at = wall_beside(planner, 5.0)
     command = planner.step(nav(on_slots(planner), cruising(planner), sigma_m=20.0), 0.0)
     assert command.plan is not None
@@ -158,6 +158,35 @@ def test_a_sigma_of_tens_of_metres_makes_no_lunge() -> None:
     assert states[at, -1, 2] < states[at, 0, 2] - 3.0  # away from the wall
     assert np.abs(states[..., 3]).max() < 3.0 + 1e-2
     assert np.abs(states[..., 6:10:2]).max() < math.radians(30.0) + 1e-3
+
+
+@pytest.mark.parametrize(
+    ("settings", "navigation", "speed_mps"),
+    [
+        ({}, "none", 0.3),
+        ({}, "kalman", 2.0),
+        ({"leaving_mps": 0.8}, "none", 0.8),
+        ({"leaving_mps": 0.8}, "kalman", 0.8),
+    ],
+)
+def test_a_margin_is_left_slowly_on_measurements_and_faster_on_estimates(
+    settings: dict[str, float], navigation: str, speed_mps: float
+) -> None:
+    """The rows of a UAV that is 0.8 m inside the margin of a wall: where they let it be at each stage."""
+    asked = problem(planner={"kind": "qp"} | settings, navigation={"filter": navigation})
+    planner = QpPlanner(asked, guided=False)
+    face, at = wall_beside(planner, 0.7)
+    planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
+    (contact,) = (each for each in planner.constraints if isinstance(each, ObstacleContact))
+    horizon = planner._last_horizon
+    assert horizon is not None
+    rows = contact.rows(horizon)
+    wall = int(np.argmax(rows.jac[0, at, 0, :, 1] < -0.99))
+    lateral = -rows.lower[0, at, :, wall]  # -y >= lower
+    whole = face - 0.3 - (3.0 + asked.planner.contact_extra_sigmas) * 0.3
+    now = face - 0.7
+    allowed = np.maximum(whole, now - speed_mps * horizon.times_s)
+    np.testing.assert_allclose(lateral, allowed, atol=1e-9)
 
 
 @pytest.mark.parametrize(("heading_deg", "axis"), [(0.0, 0), (90.0, 1), (30.0, None)])
