@@ -29,7 +29,7 @@ class SigmaMemory:
     runs, uavs : int
         Formations side by side, and UAVs of each.
     time_constant_s : float
-        In which what was reported is forgotten [s].
+        In which what was reported is forgotten; 0 remembers nothing [s].
     """
 
     def __init__(self, runs: int, uavs: int, time_constant_s: float) -> None:
@@ -49,7 +49,8 @@ class SigmaMemory:
             Since the last call [s].
         """
         out = np.empty_like(covariance)
-        part = 1.0 - math.exp(-elapsed_s / self._time_constant_s)
+        tau = self._time_constant_s
+        part = -math.expm1(-elapsed_s / tau) if tau > 0.0 else 1.0
         _raise(plain(covariance), part, self._mean, out)
         return out
 

@@ -142,6 +142,22 @@ def test_measurements_that_were_worse_are_remembered_and_a_filters_forecast_is_b
     assert farthest[True] - farthest[False] == pytest.approx(3.0 * (mean - 0.5), abs=1.0)
 
 
+@pytest.mark.parametrize("kind", ["qp", "napf_guided"])
+def test_planners_remember_sigmas_of_measurements_only(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    told, step = [], Guidance.step
+
+    def heard(self: Guidance, *given: Any, measured: bool, **named: Any) -> Guide:
+        told.append(measured)
+        return step(self, *given, measured=measured, **named)
+
+    monkeypatch.setattr(Guidance, "step", heard)
+    for name in ("none", "kalman"):
+        short = {"navigation": {"filter": name}, "simulation": {"time_limit_s": 0.5}}
+        simulate(load_problem("study_8s", short), kind, seed=1, runs=1)
+    assert told == sorted(told, reverse=True)  # first the mission on raw measurements
+    assert 0 < sum(told) < len(told)
+
+
 def test_margins_of_a_passage_let_it_pass_nearer_to_what_is_small_and_round() -> None:
     """An error of 2 m: three quarters of a wall's margin from a small ball, all of it from a post or box."""
     table = passage_margins(Inflation(3.0))

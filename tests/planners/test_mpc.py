@@ -359,17 +359,22 @@ def test_a_filtered_estimate_follows_the_taut_way_and_raw_measurements_the_guide
     for solution in (raw, replace(raw, filtered=True)):
 
         def step(
-            *_: object, taut: bool, flying: np.ndarray, sigma_map: object, shown: Guide = guide
+            *_: object,
+            taut: bool,
+            flying: np.ndarray,
+            sigma_map: object,
+            measured: bool,
+            shown: Guide = guide,
         ) -> Guide:
             assert flying.all()
             assert sigma_map is None
-            asked.append(taut)
+            asked.append((taut, measured))
             return shown if taut else replace(shown, taut=None, loose=None)
 
         assert planner._guidance is not None
         planner._guidance.step = step  # type: ignore[method-assign, assignment]
         planner.step(solution, 0.0)
-    assert asked == [False, True]
+    assert asked == [(False, True), (True, False)]
     for given, expected in ((replace(guide, taut=None, loose=None), 2.0), (guide, 0.5)):
         state = planner._state(raw, everybody)
         covariance = planner._covariance(raw, everybody)

@@ -65,3 +65,9 @@ def test_a_perfect_axis_stays_perfect() -> None:
     out = memory.raised(covariances([1.0, 0.0, 0.0]), 0.4)
     assert np.isfinite(out).all()
     assert sigmas(out)[1:] == pytest.approx([0.0, 0.0])
+
+
+def test_without_a_time_nothing_is_remembered() -> None:
+    memory = SigmaMemory(1, 1, 0.0)
+    memory.raised(covariances(5.0), 0.0)
+    assert sigmas(memory.raised(covariances(1.0), 0.4)) == pytest.approx([1.0] * 3)
