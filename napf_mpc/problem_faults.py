@@ -20,6 +20,8 @@ from napf_mpc.words import did_you_mean, nearest, shown_key_path, shown_number, 
 __all__ = ["describe_faults"]
 
 MAX_LINES = 200
+KEYS_SHOWN = 12
+"""Keys of a table that a message lists."""
 _OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 
 
@@ -276,7 +278,10 @@ def _noun(place: _Place | None) -> str:
     if kinds := place.kinds():
         return f"a table with {place.tag} = {_choice(kinds)}"
     if place.model is not None:
-        return f"a table with the keys {', '.join(place.model.model_fields)}"
+        keys = list(place.model.model_fields)
+        others = len(keys) - KEYS_SHOWN
+        more = f" and {others} others (docs/problem_files.md)" if others > 0 else ""
+        return f"a table with the keys {', '.join(keys[:KEYS_SHOWN])}{more}"
     return ""
 
 

@@ -222,6 +222,7 @@ ERRORS = '"gauss_markov", "constant", "recorded" or "gnss"'
             ": first_lane_m = 8 must be <= side_m / sqrt(2)",
         ),
         ("planner", "3", " = 3: must be a table with the keys kind, rate_hz"),
+        ("planner", "4", " others (docs/problem_files.md)"),
         (
             "reference",
             REFERENCE + "{ apff = 0.5 } }",
