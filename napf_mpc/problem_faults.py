@@ -278,10 +278,10 @@ def _noun(place: _Place | None) -> str:
     if kinds := place.kinds():
         return f"a table with {place.tag} = {_choice(kinds)}"
     if place.model is not None:
-        keys = list(place.model.model_fields)
-        others = len(keys) - KEYS_SHOWN
+        names = list(place.model.model_fields)
+        others = len(names) - KEYS_SHOWN
         more = f" and {others} others (docs/problem_files.md)" if others > 0 else ""
-        return f"a table with the keys {', '.join(keys[:KEYS_SHOWN])}{more}"
+        return f"a table with the keys {', '.join(names[:KEYS_SHOWN])}{more}"
     return ""
 
 
