@@ -2,7 +2,8 @@
 
 Run ``python benchmarks/comparison.py --runs 1000 --out out/comparison``; repeating the command goes on where
 it stopped. ``--block development`` flies the seeds on which settings were chosen, ``--block report`` (the
-default) those that no choice has seen. ``--cells`` and ``--planners`` pick rows by name.
+default) and, on raw measurements, ``--block report_raw`` those that no choice has seen. ``--cells`` and
+``--planners`` pick rows by name.
 
 Below the table stand exact McNemar tests of the planners of a cell that have the same k, on the same runs,
 corrected by Holm's method for the number of tests under the whole table.

@@ -21,7 +21,7 @@ __all__ = ["describe_faults"]
 
 MAX_LINES = 200
 KEYS_SHOWN = 12
-"""Keys of a table that a message lists."""
+"""Keys of a table that a message lists at most; one line holds no more."""
 _OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal"}
 
 
@@ -280,7 +280,7 @@ def _noun(place: _Place | None) -> str:
     if place.model is not None:
         names = list(place.model.model_fields)
         others = len(names) - KEYS_SHOWN
-        more = f" and {others} others (docs/problem_files.md)" if others > 0 else ""
+        more = f" and {others} others (napf-mpc problems --schema)" if others > 0 else ""
         return f"a table with the keys {', '.join(names[:KEYS_SHOWN])}{more}"
     return ""
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from napf_mpc.errors import ProblemError
-from napf_mpc.problem import City, FormationMission, GaussMarkov, ObstacleList, Problem, Recorded
+from napf_mpc.problem import City, FormationMission, GaussMarkov, ObstacleList, Planner, Problem, Recorded
 from napf_mpc.problem_file import load_problem, problem_schema
 from napf_mpc.shipped import shipped_problems
 
@@ -222,7 +222,6 @@ ERRORS = '"gauss_markov", "constant", "recorded" or "gnss"'
             ": first_lane_m = 8 must be <= side_m / sqrt(2)",
         ),
         ("planner", "3", " = 3: must be a table with the keys kind, rate_hz"),
-        ("planner", "4", " others (docs/problem_files.md)"),
         (
             "reference",
             REFERENCE + "{ apff = 0.5 } }",
@@ -247,6 +246,14 @@ def test_each_fault_names_key_value_and_what_is_allowed(
     assert len(faults) == 1
     assert faults[0].startswith(key)
     assert says in faults[0]
+
+
+def test_a_table_with_many_keys_lists_some_and_says_where_the_others_stand(tmp_path: Path) -> None:
+    (fault,) = faults_of(tmp_path, SMALL, "planner=3")
+    listed, _, rest = fault.partition("with the keys ")[2].partition(" and ")
+    keys = list(Planner.model_fields)
+    assert listed.split(", ") == keys[:12]
+    assert rest == f"{len(keys) - 12} others (napf-mpc problems --schema)"
 
 
 def test_missing_keys_say_what_they_must_be(tmp_path: Path) -> None:
