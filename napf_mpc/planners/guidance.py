@@ -26,6 +26,7 @@ from napf_mpc.planners.guide_search import plan_all, resample_all
 from napf_mpc.planners.guide_settings import FINE, GuidanceSettings, search_of
 from napf_mpc.planners.guide_sky import NO_SKY, SkyField, sky_field
 from napf_mpc.planners.guide_traffic import TrafficPace, slowed
+from napf_mpc.planners.room import room_outwards
 from napf_mpc.planners.sigma_memory import SigmaMemory
 from napf_mpc.planners.taut import pulled_taut
 from napf_mpc.problem import FormationMission, Problem
@@ -90,6 +91,7 @@ class Guidance:
         self._lanes = np.ascontiguousarray(self._slots[:, 1:])
         self._extra_m = problem.planner.contact_extra_m
         self._extra_sigmas = problem.planner.contact_extra_sigmas
+        self._room_m = problem.planner.cohesion_room_m
         self._min_separation = problem.vehicle.min_separation_m
         self._traffic = TrafficPace(
             self._path, problem.mission.speed_mps, problem.vehicle.radius_m, inflation
@@ -253,7 +255,13 @@ class Guidance:
                 self._inflation.k, self._search.radius_m, self._extra_m, self._extra_sigmas,
                 self.settings.taut_slope, self._kept,
             )  # fmt: skip
-            self._taut = np.concatenate([pulled, loose[..., None]], axis=-1)
+            room = np.zeros(loose.shape)
+            if self._room_m > 0.0:
+                room = room_outwards(
+                    self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
+                    self._inflation.k, self._search.radius_m, self._extra_m, self._extra_sigmas, self._room_m,
+                )  # fmt: skip
+            self._taut = np.concatenate([pulled, loose[..., None], room[..., None]], axis=-1)
         self._hold(offset, elapsed_s)
 
     def _separation(self, covariance: Array) -> Array:
@@ -316,7 +324,7 @@ class Guidance:
         if self._taut is None:
             return Guide(self.ahead_m, offset, pace, reason, breach)
         taut = self._from(self._taut, along)
-        return Guide(self.ahead_m, offset, pace, reason, breach, taut[..., :2], taut[..., 2])
+        return Guide(self.ahead_m, offset, pace, reason, breach, taut[..., :2], taut[..., 2], taut[..., 3])
 
 
 # Codes as plain numbers, for the compiled loop.

@@ -50,6 +50,9 @@ class Guide:
     """(run, uav, K, 2) the offset pulled taut, see :mod:`.taut`; by default as it is [m]."""
     loose: Array | None = None
     """(run, uav, K) part 0 to 1 of the way to the lane that is free, by default none."""
+    room: Array | None = None
+    """(run, uav, K) how far out from the lane the offset's direction is free, by default no farther than the
+    way, see :mod:`.room` [m]."""
 
     def at(self, ahead_m: Array | float) -> Array:
         """Offsets at distances ahead, linear between the places and level beyond them [m].

@@ -22,7 +22,7 @@ from napf_mpc.jit import compiled
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners import passes
-from napf_mpc.planners.cohesion import drawn_together
+from napf_mpc.planners.cohesion import drawn_together, gone_along
 from napf_mpc.planners.descent import Descent
 from napf_mpc.planners.fallback import Action, Codes, Ladder
 from napf_mpc.planners.guess import cut_at_obstacles
@@ -337,17 +337,24 @@ class QpPlanner:
         """States (run, uav, N, 12) to track, and of the way that guidance has found."""
         times = self._model.times_s
         here = self._slots.here(state[..., POSITION], self._to_be_corrected(nav, trusted, covariance))
-        share: Array | float = self.problem.planner.cohesion
+        settings = self.problem.planner
+        loose = room = None
         if guide is None:
             free = reference = way = self._slots.over_from(here, times)
         else:
             if guide.taut is None:
                 way = self._slots.over_from(here, times, guide)
                 return way, way
-            way, reference, free, loose = self._slots.ways_from(here, times, guide)
-            share = share * loose
-        if carried is not None and len(self._lanes) > 1:
-            reference = drawn_together(reference, free, carried[0], trusted, share, self._frame)
+            way, reference, free, loose, room = self._slots.ways_from(here, times, guide)
+        if carried is None or len(self._lanes) < 2:
+            return reference, way
+        alike = reference, free, carried[0], trusted
+        if loose is None or room is None:
+            return drawn_together(*alike, settings.cohesion, self._frame), way
+        if settings.cohesion_room_m > 0.0:
+            reach = settings.cohesion_room_m
+            return gone_along(*alike, settings.cohesion, self._frame, loose, room, reach), way
+        reference = drawn_together(*alike, settings.cohesion * loose, self._frame)
         return reference, way
 
     def _guess(

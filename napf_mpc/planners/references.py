@@ -45,6 +45,8 @@ class Ways(NamedTuple):
     """On the lanes."""
     loose: Array
     """(run, uav, N) part 0 to 1 of the way to the lane that is free."""
+    room: Array
+    """(run, uav, N) how far out from the lane the offset's direction is free [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,17 +126,19 @@ class SlotReference:
         """
         assert guide.taut is not None
         assert guide.loose is not None
+        room = np.zeros_like(guide.loose) if guide.room is None else guide.room
         shape = (*here.behind.shape, len(times_s))
         ways = Ways(
             np.zeros((*shape, STATES)),
             np.zeros((*shape, STATES)),
             np.zeros((*shape, STATES)),
             np.empty(shape),
+            np.empty(shape),
         )
         _write_ways(
             here, plain(self.offsets), self.speed_mps, plain(guide.pace), plain(guide.ahead_m),
-            plain(guide.offset), plain(guide.taut), plain(guide.loose), guide.reason, plain(times_s),
-            self.frame.origin, self.frame.axes, self.frame.heading_rad, ways,
+            plain(guide.offset), plain(guide.taut), plain(guide.loose), plain(room), guide.reason,
+            plain(times_s), self.frame.origin, self.frame.axes, self.frame.heading_rad, ways,
         )  # fmt: skip
         return ways
 
@@ -208,8 +212,8 @@ def _write_one(
 @compiled
 def _write_ways(
     here: Here, slots: Array, speed_mps: float, pace: Array, ahead_m: Array, bend: Array, taut: Array,
-    loose: Array, reason: NDArray[np.int8], times_s: Array, origin: Array, axes: Array, heading_rad: float,
-    ways: Ways,
+    loose: Array, room_m: Array, reason: NDArray[np.int8], times_s: Array, origin: Array, axes: Array,
+    heading_rad: float, ways: Ways,
 ) -> None:  # fmt: skip
     """Write the ways of a guide; arrays of states come as zeros.
 
@@ -239,7 +243,10 @@ def _write_ways(
                 x, y, z = free[n, 0] - origin[0], free[n, 2] - origin[1], free[n, 4] - origin[2]
                 along = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2]
                 at = min(max((along - place[0]) / spacing, 0.0), float(last))
-                loosely[n] = 0.0 if holds else loose[run, uav, min(int(at), last - 1)]
+                station = min(int(at), last - 1)
+                loosely[n] = 0.0 if holds else loose[run, uav, station]
+                nearby = min(room_m[run, uav, station], room_m[run, uav, station + 1])
+                ways.room[run, uav, n] = 0.0 if holds else nearby
 
 
 @compiled_bare

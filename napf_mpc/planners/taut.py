@@ -98,7 +98,7 @@ def pulled_taut(
 
 
 @compiled_bare
-def _distance_and_lack(
+def distance_and_lack(
     solids: Solids,
     tree: BoxTree,
     scene: int,
@@ -117,18 +117,18 @@ def _distance_and_lack(
     """Distance of a place in path coordinates to the nearest obstacle, and whether it lacks the margin."""
     px, py, pz = world_place(frame, along, left, up)
     d, gx, gy, gz, _ = nearest_obstacle(solids, tree, scene, px, py, pz, nodes, bounds)
-    need = _need(sigma_along(covariance, gx, gy, gz), k, radius_m, extra_m, extra_sigmas)
+    need = need_of(sigma_along(covariance, gx, gy, gz), k, radius_m, extra_m, extra_sigmas)
     return d, not need <= d  # what is not a number lacks it
 
 
 @compiled_bare
-def _need(sigma: float, k: float, radius_m: float, extra_m: float, extra_sigmas: float) -> float:
+def need_of(sigma: float, k: float, radius_m: float, extra_m: float, extra_sigmas: float) -> float:
     """Distance to keep where the position has a sigma towards the obstacle [m]."""
     return radius_m + k * sigma + min(extra_m, extra_sigmas * sigma)
 
 
 @compiled_bare
-def _sigma_bounds(covariance: Array) -> tuple[float, float]:
+def sigma_bounds(covariance: Array) -> tuple[float, float]:
     """Bounds on sigma over all directions (Gershgorin)."""
     least, most = np.inf, 0.0
     for a in range(3):
@@ -165,9 +165,9 @@ def _pull(
         scene = 0 if len(scene_start) == 2 else run
         for uav in range(uavs):
             c, y, z = covariance[run, uav], lanes[uav, 0], lanes[uav, 1]
-            sigmas = _sigma_bounds(c)
-            least = _need(sigmas[0], k, radius_m, extra_m, extra_sigmas) - ROUNDING_M
-            large = _need(sigmas[1], k, radius_m, extra_m, extra_sigmas) + ROUNDING_M
+            sigmas = sigma_bounds(c)
+            least = need_of(sigmas[0], k, radius_m, extra_m, extra_sigmas) - ROUNDING_M
+            large = need_of(sigmas[1], k, radius_m, extra_m, extra_sigmas) + ROUNDING_M
             ahead = 0.0
             for s in range(stations - 1, -1, -1):
                 left, up = out[run, uav, s]
@@ -197,7 +197,7 @@ def _pull(
                     lacks = want >= short
                     if not lacks and want > free:
                         kept = 1.0 - want / size
-                        d, lacks = _distance_and_lack(
+                        d, lacks = distance_and_lack(
                             solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
                             extra_m, extra_sigmas, nodes, bounds,
                         )  # fmt: skip

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from napf_mpc.formation import PathFrame
-from napf_mpc.planners.cohesion import drawn_together
+from napf_mpc.planners.cohesion import ASIDE_PART, drawn_together, gone_along
 from napf_mpc.planners.references import LARGEST_PULL_M
 
 Array = NDArray[np.float64]
@@ -79,3 +79,68 @@ def test_each_place_has_its_own_share() -> None:
     assert drawn[0, 1, 2, 2] == pytest.approx(1.0)
     drawn[0, 1, 2, 2] = 0.0
     np.testing.assert_array_equal(drawn, lanes)
+
+
+ROOM_M = 3.0
+
+
+def along(own: Array, lanes: Array, plans: Array, frame: PathFrame, loose: float, room: float) -> Array:
+    """References of :func:`gone_along` with a share of 0.8, the same looseness and room everywhere."""
+    part, free = np.full((2, 1, UAVS, STAGES), [[[[loose]]], [[[room]]]])
+    return gone_along(own, lanes, plans, ALL, 0.8, frame, part, free, ROOM_M)
+
+
+@pytest.mark.parametrize("frame", FRAMES, ids=["along x", "climbing"])
+@pytest.mark.parametrize(
+    ("mean", "room", "left", "up"),
+    [
+        ((3.0, 0.0), 3.0, 2.4, 0.0),  # they are farther out than its own metre: to c times the mean
+        ((3.0, 0.0), 2.0, 2.0 + 0.25 * 0.4, 0.0),  # as far as there is room, and beyond by its looseness
+        ((3.0, 0.0), 0.0, 1.0 + 0.25 * 1.4, 0.0),  # without room by its looseness alone
+        ((1.0, 0.0), 3.0, 1.0, 0.0),  # less far out: it stays, the two do not add up
+        ((-1.0, 0.0), 3.0, 1.0 - 0.25 * 0.8, 0.0),  # inwards is what it passes
+        ((0.0, 1.0), 0.0, 1.0, 0.8 * 0.25),  # aside by its looseness,
+        ((0.0, 1.0), 3.0, 1.0, 0.8 * (0.25 + 0.75 * ASIDE_PART)),  # and a part of the rest with all the room
+        ((0.0, 1.0), 2.0, 1.0, 0.8 * (0.25 + 0.75 * ASIDE_PART * 0.5)),  # half of that with half of it
+    ],
+)
+def test_who_passes_something_goes_along_outwards_as_far_as_there_is_room(
+    frame: PathFrame, mean: tuple[float, float], room: float, left: float, up: float
+) -> None:
+    """All keep a metre to the left of their lanes, a quarter loose, and plan to be off by the mean."""
+    lanes, own = states(np.zeros((UAVS, 3))), states(sideways(frame, [1.0] * UAVS))
+    plans = states(sideways(frame, [mean[0]] * UAVS, mean[1]))
+    drawn = along(own, lanes, plans, frame, 0.25, room)
+    np.testing.assert_allclose(drawn[..., 0:6:2] @ frame.axes[1], left, atol=1e-12)
+    np.testing.assert_allclose(drawn[..., 0:6:2] @ frame.axes[2], up, atol=1e-12)
+    np.testing.assert_allclose(drawn[..., 0:6:2] @ frame.axes[0], 0.0, atol=1e-12)
+
+
+def test_velocities_go_along_where_places_do() -> None:
+    frame = FRAMES[1]
+    lanes, own = states(np.zeros((UAVS, 3))), states(sideways(frame, [1.0] * UAVS))
+    lanes[..., 1:6:2] = 2.0 * frame.axes[0]
+    own[..., 1:6:2] = 2.0 * frame.axes[0] + 0.3 * frame.axes[1]
+    for mean, speed in ((3.0, 0.8 * 0.5), (1.0, 0.3), (-1.0, 0.3 + 0.25 * 0.8 * 0.5)):
+        plans = states(sideways(frame, [mean] * UAVS))
+        plans[..., 1:6:2] = 2.0 * frame.axes[0] + 0.5 * frame.axes[1]
+        drawn = along(own, lanes, plans, frame, 0.25, ROOM_M)
+        np.testing.assert_allclose(drawn[..., 1:6:2] @ frame.axes[1], speed, atol=1e-12)
+        np.testing.assert_allclose(drawn[..., 1:6:2] @ frame.axes[0], 2.0, atol=1e-12)
+
+
+def test_on_the_lane_both_rules_are_one() -> None:
+    frame = FRAMES[1]
+    lanes = states(np.zeros((UAVS, 3)))
+    plans = states(sideways(frame, [1.0, 2.0, -0.5, 0.3], up=0.4))
+    expected = drawn_together(lanes, lanes, plans, ALL, 0.8 * 0.5, frame)
+    np.testing.assert_allclose(along(lanes, lanes, plans, frame, 0.5, ROOM_M), expected, atol=1e-12)
+
+
+def test_nobody_goes_along_with_plans_that_nobody_follows() -> None:
+    frame = FRAMES[0]
+    lanes, own = states(np.zeros((UAVS, 3))), states(sideways(frame, [1.0] * UAVS))
+    plans = states(sideways(frame, [3.0] * UAVS))
+    whole = np.ones((1, UAVS, STAGES))
+    drawn = gone_along(own, lanes, plans, ~ALL, 0.8, frame, whole, ROOM_M * whole, ROOM_M)
+    np.testing.assert_array_equal(drawn, own)

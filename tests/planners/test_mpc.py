@@ -708,3 +708,16 @@ def test_planners_by_name_fly_with_and_without_guidance() -> None:
     assert make_planner("qp_unguided", asked)._guidance is None
     assert make_planner("qp", problem(planner={"guidance": "none"}))._guidance is None
     assert make_planner("qp_unguided", asked).name == "qp_unguided"
+
+
+def test_with_room_for_cohesion_a_formation_keeps_its_shape_better() -> None:
+    """Eight missions among eight spheres behind the filter: some centimetres of shape, paid with path."""
+    shape, path = [], []
+    for room in (0, 3):
+        settings = ['navigation.filter="kalman"', f"planner.cohesion_room_m={room}"]
+        flown = simulate(load_problem("study_8s", settings), "qp", seed=101, runs=8)
+        assert flown.score.finished.all()
+        shape.append(flown.score.metrics["shape_rms_m"])
+        path.append(flown.score.metrics["path_rms_m"])
+    assert np.mean(shape[0] - shape[1]) > 0.01  # m; 0.027 when it was written
+    assert 0.0 < np.mean(path[1] - path[0]) < 0.15  # m; 0.076

@@ -172,6 +172,11 @@ def test_uavs_that_hold_stay_on_the_guides_way() -> None:
     np.testing.assert_allclose(left["pulled"], [0.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(left["free"], [0.0, 0.0], atol=1e-12)
     np.testing.assert_array_equal(ways.loose[0, :, -1], [1.0, 0.0])
+    np.testing.assert_array_equal(ways.room, 0.0)
+    # Room is that of the narrower of two stations, and none for who holds.
+    told = replace(guide, room=np.tile([4.0, 3.0, 2.0, 1.0, 0.5], (1, 2, 1)))
+    roomy = slots.ways_from(slots.here(lanes), np.array([0.5, 1.2]), told)
+    np.testing.assert_array_equal(roomy.room[0], [[2.0, 1.0], [0.0, 0.0]])
     # Each is what a guide of that way alone leads along.
     alone = slots.over_from(slots.here(lanes), np.array([0.5, 1.0]), replace(guide, taut=None, loose=None))
     np.testing.assert_array_equal(ways.way, alone)
