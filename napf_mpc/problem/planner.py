@@ -45,7 +45,7 @@ class Planner(Section):
     cohesion: float = Field(0.86, ge=0.0, le=0.95)
     """QP planner: share of the UAVs' mean sideways deviation that each is drawn along with."""
     cohesion_room_m: float = Field(0.0, ge=0.0, le=10.0)
-    """QP planner: a UAV that has to pass something goes along with those that are farther out, where this far from its lane nothing is in the way; with 0, only where its way is loose."""  # noqa: E501
+    """QP planner, with guidance and behind a filter: a UAV that has to pass something goes along with those that are farther out, where this far from its lane nothing is in the way; with 0, only as far as its way is loose."""  # noqa: E501
     velocity_weight: float = Field(4.0, ge=0.0, le=1e6)
     """QP planner: weight of the velocity error [s/m^2]."""
     attitude_weight: float = Field(1.0, ge=0.0, le=1e6)
