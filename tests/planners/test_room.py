@@ -40,6 +40,7 @@ def test_it_ends_at_the_margin_of_what_is_farther_out() -> None:
     # The same wall is no matter to who goes the other way, nor beyond what is asked about.
     np.testing.assert_array_equal(room(-0.5, 0.0, [wall]), 4.0)
     np.testing.assert_array_equal(room(0.5, 0.0, [wall], most_m=1.25), 1.25)
+    np.testing.assert_array_equal(room(1.5, 0.0, [wall], most_m=1.75), 1.75)
 
 
 def test_what_is_passed_lies_inwards_and_takes_no_room() -> None:
