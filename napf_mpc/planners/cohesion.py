@@ -115,9 +115,7 @@ def _go(
     runs, uavs, stages = plans.shape[:3]
     off, one, own, way = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2))
     for run in range(runs):
-        count = 0
-        for uav in range(uavs):
-            count += counted[run, uav]
+        count = _followed(counted, run)
         if count == 0:
             continue
         for n in range(stages):
@@ -171,6 +169,15 @@ def _aside(state: Array, lane: Array, axes: Array, aside: Array) -> None:
 
 
 @compiled_bare
+def _followed(counted: NDArray[np.bool_], run: int) -> int:
+    """Number of UAVs of a run whose plans count."""
+    count = 0
+    for uav in range(counted.shape[1]):
+        count += counted[run, uav]
+    return count
+
+
+@compiled_bare
 def _mean(
     plans: Array, free: Array, counted: NDArray[np.bool_], axes: Array, run: int, n: int, count: int,
     one: Array, off: Array,
@@ -193,9 +200,7 @@ def _draw(
     runs, uavs, stages = plans.shape[:3]
     off, one = np.empty((2, 2)), np.empty((2, 2))
     for run in range(runs):
-        count = 0
-        for uav in range(uavs):
-            count += counted[run, uav]
+        count = _followed(counted, run)
         if count == 0:
             continue
         for n in range(stages):
