@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guide_clearance import frame_of
 from napf_mpc.planners.room import STEP_M, room_outwards
+from napf_mpc.problem_file import load_problem
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Shape, Sphere
 
@@ -53,3 +55,12 @@ def test_on_the_lane_there_is_no_direction_and_beyond_what_is_looked_for_the_off
     offset: float, expected: float
 ) -> None:
     np.testing.assert_array_equal(room(offset, 0.0, []), expected)
+
+
+def test_where_nobody_looks_for_room_asking_for_it_is_an_error() -> None:
+    room, kalman = "planner.cohesion_room_m=3", 'navigation.filter="kalman"'
+    with pytest.raises(ProblemError, match=r'cohesion_room_m = 3 is looked for by guidance.*"blended"'):
+        load_problem("study_8s", [room, kalman, 'planner.guidance="none"'])
+    with pytest.raises(ProblemError, match=r'cohesion_room_m = 3 is for ways behind a filter.*"kalman"'):
+        load_problem("study_8s", [room])
+    assert load_problem("study_8s", [room, kalman]).planner.cohesion_room_m == 3.0
