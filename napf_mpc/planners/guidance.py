@@ -28,7 +28,7 @@ from napf_mpc.planners.guide_sky import NO_SKY, SkyField, sky_field
 from napf_mpc.planners.guide_traffic import TrafficPace, slowed
 from napf_mpc.planners.room import room_outwards
 from napf_mpc.planners.sigma_memory import SigmaMemory
-from napf_mpc.planners.taut import pulled_taut
+from napf_mpc.planners.taut import Clearance, pulled_taut
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.safety_distance import Inflation, rms_sigma
 from napf_mpc.world.obstacles import ObstacleSet
@@ -89,9 +89,7 @@ class Guidance:
         self._frame = frame_of(self._path)
         self._slots = formation_offsets(problem.formation)
         self._lanes = np.ascontiguousarray(self._slots[:, 1:])
-        self._extra_m = problem.planner.contact_extra_m
-        self._extra_sigmas = problem.planner.contact_extra_sigmas
-        self._room_m = problem.planner.cohesion_room_m
+        self._room_m = problem.planner.room_m
         self._min_separation = problem.vehicle.min_separation_m
         self._traffic = TrafficPace(
             self._path, problem.mission.speed_mps, problem.vehicle.radius_m, inflation
@@ -100,6 +98,12 @@ class Guidance:
             margins = half_space_margins(inflation.k)
         self._open_sky_weight = problem.planner.open_sky_weight
         self._search = search_of(self.settings, margins, problem.vehicle.radius_m, self._open_sky_weight)
+        self._clearance = Clearance(
+            inflation.k,
+            problem.vehicle.radius_m,
+            problem.planner.contact_extra_m,
+            problem.planner.contact_extra_sigmas,
+        )
         self._blind = search_of(self.settings, margins, problem.vehicle.radius_m)
         stations = (self._search.lattice.stations - 1) * FINE + 1
         self._step_m = self._search.lattice.step_m / FINE
@@ -250,17 +254,14 @@ class Guidance:
         self._planned_at = along
         self._taut = None
         if taut:
-            pulled, loose = pulled_taut(
+            there = (
                 self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
-                self._inflation.k, self._search.radius_m, self._extra_m, self._extra_sigmas,
-                self.settings.taut_slope, self._kept,
+                self._clearance,
             )  # fmt: skip
+            pulled, loose = pulled_taut(*there, self.settings.taut_slope, self._kept)
             room = np.zeros(loose.shape)
             if self._room_m > 0.0:
-                room = room_outwards(
-                    self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
-                    self._inflation.k, self._search.radius_m, self._extra_m, self._extra_sigmas, self._room_m,
-                )  # fmt: skip
+                room = room_outwards(*there, self._room_m)
             self._taut = np.concatenate([pulled, loose[..., None], room[..., None]], axis=-1)
         self._hold(offset, elapsed_s)
 

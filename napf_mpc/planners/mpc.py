@@ -351,9 +351,8 @@ class QpPlanner:
         alike = reference, free, carried[0], trusted
         if loose is None or room is None:
             return drawn_together(*alike, settings.cohesion, self._frame), way
-        if settings.cohesion_room_m > 0.0:
-            reach = settings.cohesion_room_m
-            return gone_along(*alike, settings.cohesion, self._frame, loose, room, reach), way
+        if settings.room_m > 0.0:
+            return gone_along(*alike, settings.cohesion, self._frame, loose, room, settings.room_m), way
         reference = drawn_together(*alike, settings.cohesion * loose, self._frame)
         return reference, way
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled
 from napf_mpc.planners.guide_clearance import Frame
-from napf_mpc.planners.taut import SAME_M, distance_and_lack, need_of, sigma_bounds
+from napf_mpc.planners.taut import SAME_M, Clearance, distance_and_lack, need_of, sigma_bounds
 from napf_mpc.world.bounding_tree import STACK, BoxTree
 from napf_mpc.world.distance import Solids
 from napf_mpc.world.obstacles import ObstacleSet
@@ -33,10 +33,7 @@ def room_outwards(
     frame: Frame,
     obstacles: ObstacleSet,
     covariance: Array,
-    k: float,
-    radius_m: float,
-    extra_m: float,
-    extra_sigmas: float,
+    clearance: Clearance,
     most_m: float,
 ) -> Array:
     """Distance from the lane (run, uav, station) up to which the offset's direction is free [m].
@@ -48,15 +45,15 @@ def room_outwards(
     ----------
     profiles : array, shape (run, uav, station, 2)
         Offsets from the lanes, left and up [m].
-    along, step_m, lanes, frame, obstacles, covariance, k, radius_m, extra_m, extra_sigmas
+    along, step_m, lanes, frame, obstacles, covariance, clearance
         As :func:`.taut.pulled_taut` takes them.
     most_m : float
         How far from the lane is looked [m].
     """
     room = np.zeros(profiles.shape[:3])
     _look(
-        obstacles.solids, obstacles.tree, obstacles.scene_start, along, step_m, lanes, frame, covariance, k,
-        radius_m, extra_m, extra_sigmas, most_m, profiles, room,
+        obstacles.solids, obstacles.tree, obstacles.scene_start, along, step_m, lanes, frame, covariance,
+        clearance, most_m, profiles, room,
     )  # fmt: skip
     return room
 
@@ -71,10 +68,7 @@ def _look(
     lanes: Array,
     frame: Frame,
     covariance: Array,
-    k: float,
-    radius_m: float,
-    extra_m: float,
-    extra_sigmas: float,
+    clearance: Clearance,
     most_m: float,
     profiles: Array,
     room: Array,
@@ -84,7 +78,7 @@ def _look(
         scene = 0 if len(scene_start) == 2 else run
         for uav in range(room.shape[1]):
             c, y, z = covariance[run, uav], lanes[uav, 0], lanes[uav, 1]
-            large = need_of(sigma_bounds(c)[1], k, radius_m, extra_m, extra_sigmas)
+            large = need_of(sigma_bounds(c)[1], clearance)
             for s in range(room.shape[2]):
                 left, up = profiles[run, uav, s]
                 size = math.sqrt(left * left + up * up)
@@ -95,7 +89,7 @@ def _look(
                     want = min(free + STEP_M, most_m)
                     d, lacks = distance_and_lack(
                         solids, tree, scene, frame, along[run, uav] + s * step_m, y + want * left / size,
-                        z + want * up / size, c, k, radius_m, extra_m, extra_sigmas, nodes, bounds,
+                        z + want * up / size, c, clearance, nodes, bounds,
                     )  # fmt: skip
                     if lacks:
                         break

@@ -11,6 +11,7 @@ way must be kept: nobody flies into a dead end because its mouth is wide.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,19 @@ NEAR_M = 0.05
 """How near to the margin a place comes."""
 
 
+class Clearance(NamedTuple):
+    """What is kept between a UAV and an obstacle."""
+
+    k: float
+    """Sigmas."""
+    radius_m: float
+    """Of a UAV [m]."""
+    extra_m: float
+    """On top of the margin, at most [m]."""
+    extra_sigmas: float
+    """On top of the margin, in sigmas."""
+
+
 def pulled_taut(
     profiles: Array,
     along: Array,
@@ -43,10 +57,7 @@ def pulled_taut(
     frame: Frame,
     obstacles: ObstacleSet,
     covariance: Array,
-    k: float,
-    radius_m: float,
-    extra_m: float,
-    extra_sigmas: float,
+    clearance: Clearance,
     slope: float,
     stay: Array | None = None,
 ) -> tuple[Array, Array]:
@@ -68,12 +79,8 @@ def pulled_taut(
         The map.
     covariance : array, shape (run, uav, 3, 3)
         Of the position, whose k sigma is the margin [m^2].
-    k : float
-        Sigmas.
-    radius_m : float
-        Of a UAV [m].
-    extra_m, extra_sigmas : float
-        Distance on top of the margin: so many sigmas, at most so many metres [m].
+    clearance : Clearance
+        Kept from obstacles.
     slope : float
         At which a place leads back to the way, per metre of path.
     stay : array, shape (run, uav, station), optional
@@ -91,8 +98,8 @@ def pulled_taut(
     if stay is None:
         stay = np.zeros(profiles.shape[:3])
     _pull(
-        obstacles.solids, obstacles.tree, obstacles.scene_start, along, step_m, lanes, frame, covariance, k,
-        radius_m, extra_m, extra_sigmas, slope * step_m, stay, out, loose,
+        obstacles.solids, obstacles.tree, obstacles.scene_start, along, step_m, lanes, frame, covariance,
+        clearance, slope * step_m, stay, out, loose,
     )  # fmt: skip
     return out, loose
 
@@ -107,24 +114,22 @@ def distance_and_lack(
     left: float,
     up: float,
     covariance: Array,
-    k: float,
-    radius_m: float,
-    extra_m: float,
-    extra_sigmas: float,
+    clearance: Clearance,
     nodes: NDArray[np.int64],
     bounds: Array,
 ) -> tuple[float, bool]:
     """Distance of a place in path coordinates to the nearest obstacle, and whether it lacks the margin."""
     px, py, pz = world_place(frame, along, left, up)
     d, gx, gy, gz, _ = nearest_obstacle(solids, tree, scene, px, py, pz, nodes, bounds)
-    need = need_of(sigma_along(covariance, gx, gy, gz), k, radius_m, extra_m, extra_sigmas)
+    need = need_of(sigma_along(covariance, gx, gy, gz), clearance)
     return d, not need <= d  # what is not a number lacks it
 
 
 @compiled_bare
-def need_of(sigma: float, k: float, radius_m: float, extra_m: float, extra_sigmas: float) -> float:
+def need_of(sigma: float, clearance: Clearance) -> float:
     """Distance to keep where the position has a sigma towards the obstacle [m]."""
-    return radius_m + k * sigma + min(extra_m, extra_sigmas * sigma)
+    extra = min(clearance.extra_m, clearance.extra_sigmas * sigma)
+    return clearance.radius_m + clearance.k * sigma + extra
 
 
 @compiled_bare
@@ -149,10 +154,7 @@ def _pull(
     lanes: Array,
     frame: Frame,
     covariance: Array,
-    k: float,
-    radius_m: float,
-    extra_m: float,
-    extra_sigmas: float,
+    clearance: Clearance,
     most: float,
     stay: Array,
     out: Array,
@@ -166,8 +168,8 @@ def _pull(
         for uav in range(uavs):
             c, y, z = covariance[run, uav], lanes[uav, 0], lanes[uav, 1]
             sigmas = sigma_bounds(c)
-            least = need_of(sigmas[0], k, radius_m, extra_m, extra_sigmas) - ROUNDING_M
-            large = need_of(sigmas[1], k, radius_m, extra_m, extra_sigmas) + ROUNDING_M
+            least = need_of(sigmas[0], clearance) - ROUNDING_M
+            large = need_of(sigmas[1], clearance) + ROUNDING_M
             ahead = 0.0
             for s in range(stations - 1, -1, -1):
                 left, up = out[run, uav, s]
@@ -198,8 +200,8 @@ def _pull(
                     if not lacks and want > free:
                         kept = 1.0 - want / size
                         d, lacks = distance_and_lack(
-                            solids, tree, scene, frame, place, y + kept * left, z + kept * up, c, k, radius_m,
-                            extra_m, extra_sigmas, nodes, bounds,
+                            solids, tree, scene, frame, place, y + kept * left, z + kept * up, c,
+                            clearance, nodes, bounds,
                         )  # fmt: skip
                         if lacks:
                             short = want - max(0.0, least - d)

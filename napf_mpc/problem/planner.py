@@ -42,15 +42,15 @@ class Planner(Section):
     """QP planner: nearest obstacles that each stage of each UAV keeps rows for, in each of two shells."""
     position_weight: float = Field(5.0, ge=1e-6, le=1e6)
     """QP planner: weight of the distance to the slot [1/(m^2 s)]."""
-    cohesion: float = Field(0.86, ge=0.0, le=0.95)
+    cohesion: float = Field(0.87, ge=0.0, le=0.95)
     """QP planner: share of the UAVs' mean sideways deviation that each is drawn along with."""
-    cohesion_room_m: float = Field(0.0, ge=0.0, le=10.0)
-    """QP planner, with guidance and behind a filter: a UAV that has to pass something goes along with those that are farther out, where this far from its lane nothing is in the way; with 0, only as far as its way is loose."""  # noqa: E501
-    velocity_weight: float = Field(4.0, ge=0.0, le=1e6)
+    cohesion_room_m: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
+    """QP planner, with guidance and behind a filter: a UAV that has to pass something goes along with those that are farther out, where this far from its lane nothing is in the way, by default 3; with 0, only as far as its way is loose."""  # noqa: E501
+    velocity_weight: float = Field(6.0, ge=0.0, le=1e6)
     """QP planner: weight of the velocity error [s/m^2]."""
     attitude_weight: float = Field(1.0, ge=0.0, le=1e6)
     """QP planner: weight of roll, pitch and yaw error [1/(rad^2 s)]; a fifth of it on body rates."""
-    thrust_weight: float = Field(80.0, ge=1e-9, le=1e6)
+    thrust_weight: float = Field(60.0, ge=1e-9, le=1e6)
     """QP planner: weight of the thrust about hover [1/(N^2 s)]."""
     torque_weight: float = Field(600.0, ge=1e-9, le=1e6)
     """QP planner: weight of the torques [1/(N^2 m^2 s)]."""
@@ -91,6 +91,11 @@ class Planner(Section):
 
     safety: Literal["k_sigma", "overbound", "protection_level"] = "k_sigma"
     """What drives the safety distance: k reported sigmas; k sigmas of the reported law's overbound; or the protection level, whatever k is (docs/integrity.md)."""  # noqa: E501
+
+    @property
+    def room_m(self) -> float:
+        """``cohesion_room_m``, or its default; only looked for with guidance and behind a filter [m]."""
+        return 3.0 if self.cohesion_room_m is None else self.cohesion_room_m
 
     @model_validator(mode="after")
     def _one_confidence(self) -> Planner:

@@ -111,17 +111,17 @@ class Problem(Section):
                     f'{weight} is a price that guidance pays, and planner.guidance = "none" has none: set '
                     'guidance = "blended", or open_sky_weight = 0'
                 ]
-        if self.planner.cohesion_room_m > 0.0:
+        if self.planner.cohesion_room_m:
             room = f"planner.cohesion_room_m = {self.planner.cohesion_room_m:g}"
             if self.planner.guidance == "none":
                 return [
                     f'{room} is looked for by guidance, and planner.guidance = "none" has none: set '
-                    'guidance = "blended", or cohesion_room_m = 0'
+                    'guidance = "blended", or leave cohesion_room_m out'
                 ]
             if navigation.filter == "none":
                 return [
                     f'{room} is for ways behind a filter, and navigation.filter = "none" has none: set '
-                    'filter = "kalman" or "point_mass", or cohesion_room_m = 0'
+                    'filter = "kalman" or "point_mass", or leave cohesion_room_m out'
                 ]
         if self.planner.safety == "overbound":
             if not isinstance(navigation, Recorded):

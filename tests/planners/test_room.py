@@ -8,6 +8,7 @@ from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guide_clearance import frame_of
 from napf_mpc.planners.room import STEP_M, room_outwards
+from napf_mpc.planners.taut import Clearance
 from napf_mpc.problem_file import load_problem
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Shape, Sphere
@@ -23,8 +24,8 @@ def room(left: float, up: float, shapes: list[Shape], most_m: float = 4.0, lane:
     """Of one UAV that starts at 0, with the same offset everywhere."""
     return room_outwards(
         np.tile([left, up], (1, 1, STATIONS, 1)), np.zeros((1, 1)), 1.0, np.array([[lane, 0.0]]),
-        frame_of(PATH), ObstacleSet.from_shapes(shapes), SIGMA**2 * np.eye(3)[None, None], K, RADIUS, 0.4,
-        10.0, most_m,
+        frame_of(PATH), ObstacleSet.from_shapes(shapes), SIGMA**2 * np.eye(3)[None, None],
+        Clearance(K, RADIUS, 0.4, 10.0), most_m,
     )[0, 0]  # fmt: skip
 
 
@@ -63,4 +64,10 @@ def test_where_nobody_looks_for_room_asking_for_it_is_an_error() -> None:
         load_problem("study_8s", [room, kalman, 'planner.guidance="none"'])
     with pytest.raises(ProblemError, match=r'cohesion_room_m = 3 is for ways behind a filter.*"kalman"'):
         load_problem("study_8s", [room])
-    assert load_problem("study_8s", [room, kalman]).planner.cohesion_room_m == 3.0
+    assert load_problem("study_8s", [room, kalman]).planner.room_m == 3.0
+
+
+def test_by_default_room_is_asked_for_and_problems_that_have_none_to_look_for_are_sound() -> None:
+    for settings in ([], ['planner.guidance="none"'], ['navigation.filter="kalman"']):
+        assert load_problem("study_8s", settings).planner.room_m == 3.0
+    assert load_problem("study_8s", ["planner.cohesion_room_m=0"]).planner.room_m == 0.0

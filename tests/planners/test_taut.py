@@ -11,7 +11,7 @@ from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import frame_of
 from napf_mpc.planners.references import SlotReference
-from napf_mpc.planners.taut import NEAR_M, SAME_M, STEPS, pulled_taut
+from napf_mpc.planners.taut import NEAR_M, SAME_M, STEPS, Clearance, pulled_taut
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 
@@ -30,7 +30,7 @@ def pulled(
     """Offsets (station, 2) and how loose they are, of one UAV that starts at 0."""
     offsets, loose = pulled_taut(
         profile[None, None], np.zeros((1, 1)), STEP, LANE, frame_of(PATH), ObstacleSet.from_shapes(shapes),
-        SIGMA**2 * np.eye(3)[None, None], K, RADIUS, *extra, slope,
+        SIGMA**2 * np.eye(3)[None, None], Clearance(K, RADIUS, *extra), slope,
     )  # fmt: skip
     return offsets[0, 0], loose[0, 0]
 
@@ -123,7 +123,7 @@ def test_no_question_that_is_left_out_would_have_changed_anything(name: str, k: 
         profile = np.cumsum(rng.normal(0.0, 0.6, (STATIONS, 2)) * (1.0, 0.3), axis=0)
         given = (
             profile[None, None], np.zeros((1, 1)), STEP, LANE, frame_of(PATH), world, covariance[None, None],
-            k, RADIUS, 0.75, 0.95, 0.35,
+            Clearance(k, RADIUS, 0.75, 0.95), 0.35,
         )  # fmt: skip
         quick = pulled_taut(*given)
         slow = asked_everywhere(profile, world, covariance, k)
