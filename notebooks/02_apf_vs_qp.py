@@ -15,8 +15,8 @@
 # # Potential field against QP, on the same mission
 #
 # `apf` and `napf` turn the distance to an obstacle into a velocity, here and now. `qp` puts the same
-# repulsion into one quadratic program a UAV and step, which looks seven seconds ahead. All three fly the
-# same scenes with the same navigation errors, and see them through the same Kalman filter.
+# repulsion into one quadratic program a UAV and step, which looks 6.5 s ahead. All three fly the same
+# scenes with the same navigation errors, and see them through the same Kalman filter.
 #
 # Every number and picture below is computed here. How many missions stand behind the table follows from
 # the variable `NAPF_MPC_NOTEBOOK_RUNS` (300 unless set; a tenth of it is flown, since a QP mission takes
@@ -133,7 +133,7 @@ figure
 # ## 4. What does slack mean?
 #
 # A row of the QP says "stay k sigma clear". Where that cannot be had, the row yields by a slack, in metres,
-# at a price above all else that the plan is asked for. `slack_m` is the most that a plan yields anywhere on
+# at a price above what the slot is worth. `slack_m` is the most that a plan yields anywhere on
 # its horizon: a forecast, mostly of seconds ahead, not a contact. A slack below the margin spends
 # confidence; one above it is a plan that goes through the obstacle, as far as this step sees it.
 #

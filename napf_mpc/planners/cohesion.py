@@ -53,7 +53,7 @@ def drawn_together(
     Returns
     -------
     array, shape (run, uav, N, 12)
-        References; a UAV more than ``LARGEST_PULL_M`` off counts as this far.
+        References; a plan more than ``LARGEST_PULL_M`` off, left or up, counts as this far.
     """
     out = reference.copy()
     shares = np.asarray(share, dtype=np.float64)

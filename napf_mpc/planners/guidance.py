@@ -3,7 +3,8 @@
 Every UAV has a lane; guidance tells it by how much to leave the lane over the next tens of metres, and how
 fast to go. It sees what a planner sees, estimates and the map, and keeps the radius and k sigma from every
 obstacle, with a little to spare. What cannot be passed with that margin is not squeezed through: the
-formation slows, holds in front of it, and if the hold lasts too long, gives up with the reason "no passage".
+formation slows, holds in front of it, and if the hold lasts too long, gives up with the reason "no safe
+passage".
 """
 
 from __future__ import annotations

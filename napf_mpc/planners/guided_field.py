@@ -36,7 +36,8 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
 
     Moving obstacles repel as in NAPF, and guidance slows where they will cross the way.
 
-    Away from obstacles it flies exactly like :class:`~napf_mpc.planners.potential_field.NapfPlanner`.
+    Away from obstacles it flies like :class:`~napf_mpc.planners.potential_field.NapfPlanner`, but that who is
+    ahead slows for a UAV left far behind.
 
     Parameters
     ----------

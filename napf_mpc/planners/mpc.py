@@ -208,7 +208,7 @@ class QpPlanner:
         self._outlines: list[Hashable] = []
 
     def build(self, nav: NavSolution, time_s: float) -> HorizonQp:
-        """Programs of this step, in coordinates whose origin is each UAV's reported position."""
+        """Programs of this step without a guide; the origin is where each UAV is reported to be."""
         nav = self._inflation.informed(nav)
         trusted = nav.trusted()
         state = self._state(nav, trusted)

@@ -27,7 +27,7 @@ class Reason(IntEnum):
     NAVIGATION = 2
     """Its navigation is not to be trusted."""
     SOLVER = 3
-    """No answer of the solver could be flown for too long."""
+    """No answer of the solver can be flown, nor the rest of the last plan."""
     NO_PASSAGE = 4
     """There is no safe passage at this confidence."""
 
@@ -54,7 +54,7 @@ class Command:
     yaw: Array
     """(run, uav) reference yaw [rad]."""
     holding: NDArray[np.bool_]
-    """(run, uav): hovering because the planner has no navigation that it trusts, or no way."""
+    """(run, uav): hovering because the planner has no navigation that it trusts, no plan, or no way."""
     feedforward: Array
     """(run, uav, 4) inputs about hover [N, N m]; zero where the planner leaves them to the feedback."""
     plan: Plan | None = None

@@ -13,7 +13,7 @@ class Planner(Section):
     """The planner and its potential field (Eq. 23-39, section 3.2)."""
 
     kind: Literal["apf", "napf", "napf_guided", "qp", "qp_unguided"] = "napf"
-    """Planner that ``run`` flies unless told otherwise."""
+    """Planner that commands for one planner fly unless told otherwise."""
     rate_hz: float = Field(10.0, ge=0.5, le=100.0)
     """Rate at which the planner is asked."""
     influence_m: float = Field(3.0, ge=0.01, le=1e3)
@@ -43,7 +43,7 @@ class Planner(Section):
     position_weight: float = Field(5.0, ge=1e-6, le=1e6)
     """QP planner: weight of the distance to the slot [1/(m^2 s)]."""
     cohesion: float = Field(0.87, ge=0.0, le=0.95)
-    """QP planner: share of the UAVs' mean sideways deviation that each is drawn along with."""
+    """QP planner: share of the UAVs' mean sideways deviation that each is drawn along with; behind a filter, or without guidance."""  # noqa: E501
     cohesion_room_m: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
     """QP planner, with guidance and behind a filter: a UAV that has to pass something goes along with those that are farther out, where this far from its lane nothing is in the way, by default 3; with 0, only as far as its way is loose."""  # noqa: E501
     velocity_weight: float = Field(6.0, ge=0.0, le=1e6)
@@ -71,7 +71,7 @@ class Planner(Section):
     influence_scale: float = Field(0.01, ge=1e-9, le=1e6)
     """QP planner: price per metre and second for each m/s of NAPF's repulsion."""
     k: Annotated[float, Field(ge=0.0, le=20.0)] | None = None
-    """Inflation in reported sigmas; 3 unless ``confidence`` is given."""
+    """Inflation in reported sigmas; 3 unless ``confidence`` or ``risk_per_mission`` is given."""
     confidence: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     """Two-sided probability from which k follows: k = sqrt(2) erfinv(confidence)."""
     risk_per_mission: Annotated[float, Field(ge=1e-9, le=0.5)] | None = None
