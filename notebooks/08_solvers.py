@@ -15,8 +15,8 @@
 # # Who solves the planner's programs
 #
 # Each UAV solves one quadratic program a step: 20 stages of a 12-state quadrotor, 22 rows a stage, 18
-# of them soft. Here missions are flown, the programs that the planner shows its solver are kept, and each is shown to all
-# solvers that are installed. What a solver claims and what is correct are two different columns.
+# of them soft. Here missions are flown, the programs that the planner shows its solver are kept, and each is
+# shown to all solvers that are installed. What a solver claims and what is correct are two different columns.
 #
 # `NAPF_MPC_NOTEBOOK_RUNS` (300 unless set) decides how many missions are flown: a hundredth of it, at least
 # two. Times are processor times of this machine; what carries over to another are their ratios.

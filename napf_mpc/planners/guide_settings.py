@@ -34,7 +34,7 @@ class GuidanceSettings:
     sphere_layers: int = 8
     """Layers to pass spheres, half of them up and half down."""
     wide_m: float = 6.0
-    """With radius, spare and margin beyond this, cells and layers are twice as large, and reach farther aside."""
+    """With radius, spare and margin beyond this, cells and layers are twice as large, and reach farther."""
     path: float = 8.5
     """Price of a squared offset from the lane [1/m^2 per metre of path]."""
     wide_path: float = 3.8
