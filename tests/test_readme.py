@@ -71,6 +71,13 @@ def test_the_main_job_flies_a_shipped_problem() -> None:
     assert re.search(r"napf-mpc compare (\w+) ", command)[1] in shipped_problems()  # type: ignore[index]
 
 
+def test_no_two_commands_of_the_readme_write_into_one_folder() -> None:
+    """A folder with another campaign's results is refused."""
+    folders = re.findall(r"napf-mpc (?:run|compare|montecarlo|sweep|rare) [^`]*?--out (\w+)", README)
+    assert len(folders) >= 3
+    assert len(set(folders)) == len(folders), folders
+
+
 def test_every_shipped_problem_is_in_the_table() -> None:
     table = README.partition("## Problem files")[2].partition("## Limits")[0]
     assert set(re.findall(r"`([a-z0-9]+_[a-z0-9_]+)`", table)) == set(shipped_problems())
