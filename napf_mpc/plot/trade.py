@@ -82,7 +82,7 @@ def fronts_figure(
     if not levels:
         raise ValueError("fronts is empty: there is nothing to draw")
     markers = {k: K_MARKERS[i % len(K_MARKERS)] for i, k in enumerate(levels)}
-    tall, title, between, bottom, top = 1.45, 0.2, 0.3, 0.42, 0.5
+    tall, title, between, bottom, top = 1.45, 0.2, 0.3, 0.42, 0.56
     row = tall + title + between
     height = bottom + row * len(fronts) - between + top
     page = Page.of_size(PAGE_IN, height, " ".join(words for words in (note, credit) if words))
@@ -116,7 +116,7 @@ def fronts_figure(
         for k in levels
     ]
     every = [part for cell in fronts.values() for front in cell.values() for part in front.values()]
-    _key(page, height - 0.02, handles, every)
+    _key(page, height - 0.06, handles, every)
     return page.figure
 
 
