@@ -90,6 +90,7 @@ def test_keys_and_defaults_of_the_qp_page_are_those_of_the_planner() -> None:
     assert len(quoted) >= 10
     for key, value in quoted:
         assert getattr(settings, key) == float(value), key
+    assert f"`planner.cohesion_room_m` from the lane,\nby default {settings.room_m:g} m" in QP_PAGE
 
 
 def test_the_grid_of_the_qp_page_is_the_default_one() -> None:
