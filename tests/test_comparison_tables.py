@@ -153,3 +153,21 @@ def test_a_formation_that_orca_leaves_alone_flies_its_lanes(orca: Any) -> None:
     score = simulate(problem, orca.OrcaPlanner(problem, Inflation(3.0), "orca"), runs=1).score
     assert [str(outcome) for outcome in score.outcome] == ["reached"]
     assert score.metrics["path_rms_m"][0] < 0.5
+
+
+def test_the_table_of_wrong_sigmas_counts_first_alarms_and_bounds_medians(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import monitor_scale
+
+    # The true median of 100 values lies outside of the 40th and 61st in one case of 28.
+    assert monitor_scale.median_interval(np.arange(100.0, 0.0, -1.0)) == (40.0, 61.0)
+    cause = "reported sigma up too small for its innovations"
+    events = {
+        "run": [0, 0, 0, 1, 1],
+        "uav": [0, 0, 2, 0, 1],
+        "t_s": [30.0, 20.0, 50.0, 40.0, 1.0],
+        "cause": [cause, cause, cause, cause, "upset"],
+    }
+    assert sorted(monitor_scale.first_alarms(events)) == [20.0, 40.0, 50.0]
