@@ -20,11 +20,12 @@ def compiled(function: F) -> F:
 
 
 def compiled_bare(function: F) -> F:
-    """The same without reference counts, for functions that allocate nothing.
+    """The same without reference counts, its code put into that of its callers: for what allocates nothing.
 
-    A count for every array of every call costs more than the few sums of a small function. What such a
-    function calls is compiled so as well.
+    A count for every array of every call costs more than the few sums of a small function, and so does
+    handing over named tuples: field by field, seven words an array and more. What such a function calls is
+    compiled so as well.
     """
     # Not among the options that numba's types know.
-    bare: dict[str, Any] = {"_nrt": False}
+    bare: dict[str, Any] = {"_nrt": False, "forceinline": True}
     return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", **bare)(function))
