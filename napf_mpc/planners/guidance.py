@@ -124,6 +124,7 @@ class Guidance:
         self._taut: Array | None = None
         self._missing = np.zeros((runs, uavs, stations))
         self._kept = np.zeros((runs, uavs, stations))
+        self._paid = np.zeros((runs, uavs + 1, 2))
         self._sigma_map: SigmaMap | None = None
         self._sky: SkyField = NO_SKY
         self._busy = np.zeros(runs, dtype=bool)
@@ -250,6 +251,7 @@ class Guidance:
             self._profiles,
             self._missing,
             self._kept,
+            self._paid,
             self._busy,
         )
         self._planned_at = along

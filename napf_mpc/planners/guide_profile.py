@@ -35,8 +35,9 @@ HALO = 4
 LAYER_HALO = 2
 NOWHERE = 1 << 30
 """First place of a row without any; its last is this, negative."""
-FIRST_GUESS = 400.0
-"""Price of a profile, per UAV, that the search first takes for an upper bound."""
+FIRST_GUESS, GUESS, RAISE = 400.0, 1.1, 2.0
+"""What the search first takes for an upper bound: this price per UAV, or so many times what was paid last;
+and by what it raises a bound that was too low."""
 
 
 class Bench(NamedTuple):
@@ -378,11 +379,13 @@ def cheapest_profile(
     query: Query,
     bench: Bench,
     offset: Array,
+    paid: float,
     profile: Array,
 ) -> float:
     """Cheapest profile (station, 2) from where a UAV is, or the nearest place that the lattice knows.
 
-    Returns its price.
+    What was paid for the last one, zero if there was none, is a first guess at the price: it makes the search
+    short and changes nothing else. Returns the price.
     """
     weight = float(query.stop - query.first)
     c = min(max(round(offset[0] / lattice.cell_m) + lattice.half, 0), 2 * lattice.half)
@@ -394,20 +397,22 @@ def cheapest_profile(
     known = price_of(sight, lattice, below, layers, prices, query, bench.bend, edge, c, v, wanted)
     # Sums are rounded: a little above the price of a profile that is there.
     known += 1e-9 * known + 1e-9
-    guess = FIRST_GUESS * weight
-    limit = guess if layers > 1 else known
-    # On the lane's own layer first, if that may lower the bound: it has few places.
-    level = layers > 1 and v == below and known > guess
+    limit = GUESS * paid + weight if paid > 0.0 else FIRST_GUESS * weight
+    # On the lane's own layer alone if a guess was too low: it has few places, and lowers the bound.
+    level = layers > 1 and v == below
     while True:
-        final = not level and not limit < 0.5 * known
+        final = not limit < known
         price = search_within(
-            sight, lattice, below, below if level else 0, below if level else layers - 1, prices, query,
-            bench, edge, c, v, known if level or final else limit, profile,
+            sight, lattice, below, 0, layers - 1, prices, query,
+            bench, edge, c, v, known if final else limit, profile,
         )  # fmt: skip
+        if final or price < np.inf:
+            return price
         if level:
             level = False
+            price = search_within(
+                sight, lattice, below, below, below, prices, query,
+                bench, edge, c, v, known, profile,
+            )  # fmt: skip
             known = min(known, price + 1e-9 * price)
-        elif final or price < np.inf:
-            return price
-        else:
-            limit *= 4.0
+        limit *= RAISE

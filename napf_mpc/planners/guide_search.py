@@ -207,6 +207,7 @@ def plan_run(
     profiles: Array,
     missing: Array,
     kept: Array,
+    paid: Array,
     scratch: Scratch,
 ) -> bool:
     """Plan the profiles of one run's UAVs.
@@ -237,6 +238,9 @@ def plan_run(
         Written: profiles, and their shortfalls [m].
     kept : array, shape (uav, station)
         Written with a price of the sky only: how far from the lane it is best to stay [m].
+    paid : array, shape (uav + 1, 2)
+        Updated: prices of the cheapest profiles found last, each UAV's and last the one for all, by draft;
+        zero for none.
     scratch : Scratch
         Written over.
 
@@ -350,10 +354,11 @@ def plan_run(
                 0 if shared else i, uavs if shared else i + 1, 0.0 if shared else prices.shape, draft_mean,
                 last, coarse, separation, crowded, aside,
             )  # fmt: skip
-            chosen = coarse[max(i, 0)]
-            cheapest_profile(
-                sight, lattice, below, layers, prices, query, bench, middle if shared else offset[i], chosen
-            )
+            chosen, own = coarse[max(i, 0)], uavs if shared else i
+            paid[own, draft] = cheapest_profile(
+                sight, lattice, below, layers, prices, query, bench, middle if shared else offset[i],
+                paid[own, draft], chosen,
+            )  # fmt: skip
             if shared:
                 _refine(chosen, lattice.fine, draft_mean)
                 continue
@@ -428,6 +433,7 @@ def _plan_runs(
     profiles: Array,
     missing: Array,
     kept: Array,
+    paid: Array,
     busy: NDArray[np.bool_],
     scratch: Scratch,
 ) -> None:
@@ -438,7 +444,7 @@ def _plan_runs(
         busy[r] = plan_run(
             solids, boxes, scene_start[scene], scene_start[scene + 1], frame, field, r, along[r], offset[r],
             lanes, covariance[r], separation[r], last[r], stuck[r], search, profiles[r], missing[r], kept[r],
-            scratch,
+            paid[r], scratch,
         )  # fmt: skip
 
 
@@ -478,6 +484,7 @@ def plan_all(
     profiles: Array,
     missing: Array,
     kept: Array,
+    paid: Array,
     busy: NDArray[np.bool_],
 ) -> None:
     """Plan all runs that are due, each from its own scene and state alone; see :func:`plan_run`."""
@@ -486,7 +493,7 @@ def plan_all(
     most = min(MOST_SOLIDS, 1 << max(largest - 1, 1).bit_length())
     _plan_runs(
         solids, boxes, scene_start, frame, field, due, along, offset, lanes, covariance, separation, last,
-        stuck, search, profiles, missing, kept, busy,
+        stuck, search, profiles, missing, kept, paid, busy,
         _KEPT.of(profiles.shape[1], profiles.shape[2], most, search),
     )  # fmt: skip
 

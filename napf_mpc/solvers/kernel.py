@@ -183,7 +183,7 @@ class KernelSolver:
         if asked is not None and asked.shape != (runs,):
             raise QpError(f"active has shape {asked.shape}, must be ({runs},)")
         guesses = checked_guess(warm, (runs, uavs, n), (runs, uavs, m))
-        z, y = np.zeros((batch, n)), np.zeros((batch, m))
+        z, y = np.empty((batch, n)), np.empty((batch, m))
         residuals, ends, steps = np.full((batch, 3), np.inf), np.full(batch, -1), np.full(batch, -1)
         initial = _plain(horizon.initial).reshape(batch, STATES)
         reference = _plain(horizon.reference).reshape(batch, stages, STATES)

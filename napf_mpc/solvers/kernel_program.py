@@ -315,6 +315,8 @@ def certify(
     out, n = room.certificate, lanes.states.shape[0]
     for e in range(6):
         out[e] = lanes.balance[e, lane]
+    for i in range(y.shape[1]):
+        y[at, i] = 0.0
     for k in range(n):
         for i in range(STATES):
             z[at, k * STATES + i] = lanes.states[k, i, lane]
@@ -359,13 +361,6 @@ def certify(
 
 
 @compiled_bare
-def clear_multipliers(program: Program, y: Array, at: int) -> None:
-    """Zero the multipliers of all rows before they are written again."""
-    for r in range(len(program.places.group)):
-        y[at, program.places.y_low[r]], y[at, program.places.y_high[r]] = 0.0, 0.0
-
-
-@compiled_bare
 def solve_alone(
     maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room, lanes: Lanes,
     at: int, warm: bool, guess_z: Array, guess_y: Array, guess_at: int, limit: int, z: Array, y: Array,
@@ -389,7 +384,6 @@ def solve_alone(
                     break
                 status = solve_rows(maps, program, work, room, lanes, limit)
         if status == OPTIMAL:
-            clear_multipliers(program, y, at)
             stationarity(maps, lanes)
             if certify(program, table, u, work, room, lanes, 0, at, z, y) <= EXACT:
                 return OPTIMAL

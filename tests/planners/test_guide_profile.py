@@ -242,9 +242,17 @@ def test_what_is_left_out_was_not_cheaper(seed: int, aside: float, most_sky: flo
         Query(0, 2, 0.0, mean, last, chosen, separation, False, aside),
     ):
         profile = np.empty((LATTICE.stations, 2))
-        price = cheapest_profile(sight, LATTICE, BELOW, LAYERS, PRICES, query, bench(), offset, profile)
+        price = cheapest_profile(sight, LATTICE, BELOW, LAYERS, PRICES, query, bench(), offset, 0.0, profile)
         node = node_prices(sight, query, missing)
         assert price == pytest.approx(exhaustive(node, start, query.stop - query.first, aside), rel=1e-9)
+        for paid in (1e-12, 0.2 * price, 0.9 * price, price, 3.0 * price, 1e9):
+            # A guess at the price, too low, right or too high, changes nothing.
+            same = np.empty((LATTICE.stations, 2))
+            found = cheapest_profile(
+                sight, LATTICE, BELOW, LAYERS, PRICES, query, bench(), offset, paid, same
+            )  # fmt: skip
+            assert found == price
+            np.testing.assert_array_equal(same, profile)
         if query.first == 0 and query.stop == 1:
             chosen[0] = profile
 
