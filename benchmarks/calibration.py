@@ -146,10 +146,10 @@ def table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Non
         print("| " + " | ".join(row) + " |")
 
 
-def wall_rows(draws: dict[float, Draws]) -> None:
+def wall_rows(draws: dict[float, Draws], levels: Sequence[float]) -> None:
     rows = []
     for bearing in (0.0, 30.0):
-        for asked in ASKED:
+        for asked in levels:
             contact = held_point(draws[10.0], "wall", 0.0, step_k(asked), bearing)
             step = per_step(contact)
             row = [f"{bearing:.0f}°", f"{100 * asked:g}", percent(step), ratio(step, asked)]
@@ -160,22 +160,22 @@ def wall_rows(draws: dict[float, Draws]) -> None:
     rows = []
     for bearing in (0.0, 30.0):
         for tau in TIMES:
-            for asked in ASKED:
-                level = budget(asked, tau).k
-                mission = per_mission(held_point(draws[tau], "wall", 0.0, level, bearing))
-                row = [f"{bearing:.0f}°", f"{tau:g}", f"{100 * asked:g}", f"{level:.3f}", percent(mission)]
+            for asked in levels:
+                k = budget(asked, tau).k
+                mission = per_mission(held_point(draws[tau], "wall", 0.0, k, bearing))
+                row = [f"{bearing:.0f}°", f"{tau:g}", f"{100 * asked:g}", f"{k:.3f}", percent(mission)]
                 rows.append([*row, ratio(mission, asked), verdict(mission, asked, 1 / 3, 1.0)])
     names = ("wall's bearing", "tau, s", "asked, %", "k", "achieved, %", "achieved / asked", "1/3-1")
     table(f"2. Wall, asked per mission of 15 s, {len(contact)} missions a row", names, rows)
 
 
-def solid_rows(draws: dict[float, Draws]) -> None:
+def solid_rows(draws: dict[float, Draws], levels: Sequence[float]) -> None:
     runs = len(draws[10.0].error)
     rows = []
     for shape in ("sphere", "cylinder"):
         for radius in RADII:
             row = [shape, f"{radius:g}"]
-            for asked in ASKED:
+            for asked in levels:
                 step = per_step(held_point(draws[10.0], shape, radius, step_k(asked), 30.0))
                 small = on_surface(draws[10.0], shape, radius, step_k(asked))
                 row += [ratio(step, asked), "no margin" if small else verdict(step, asked, 0.3, 1.0)]
@@ -183,7 +183,7 @@ def solid_rows(draws: dict[float, Draws]) -> None:
     head = [
         "shape",
         "radius, m",
-        *(cell for p in ASKED for cell in (f"achieved / asked {100 * p:g} %", "0.3-1")),
+        *(cell for p in levels for cell in (f"achieved / asked {100 * p:g} %", "0.3-1")),
     ]
     table(f"3a. Exact margin, asked per step, tau 10 s, {runs} missions a row", head, rows)
 
@@ -192,7 +192,7 @@ def solid_rows(draws: dict[float, Draws]) -> None:
         for shape in ("sphere", "cylinder"):
             for radius in RADII:
                 row = [shape, f"{radius:g}"]
-                for asked in ASKED:
+                for asked in levels:
                     whole = budget(asked, tau)
                     mission = per_mission(held_point(draws[tau], shape, radius, whole.k, 30.0, whole))
                     row += [ratio(mission, asked), verdict(mission, asked, 0.3, 1.0)]
@@ -264,10 +264,12 @@ def fly(problem: Problem, planner: str, seeds: Sequence[int], runs: int) -> Flow
     return Flown(np.concatenate(contact), np.concatenate(bound), float(np.mean(clearance)))
 
 
-def closed_loop_rows(planners: Sequence[str], seeds: Sequence[int], runs: int) -> None:
+def closed_loop_rows(
+    planners: Sequence[str], levels: Sequence[float], seeds: Sequence[int], runs: int
+) -> None:
     rows = []
     for planner in planners:
-        for asked in ASKED:
+        for asked in levels:
             flown = fly(wall_problem(risk_per_mission=asked), planner, seeds, runs)
             mission = per_mission(flown.contact)
             unannounced = int((flown.contact.any(-1) & (flown.bound <= asked)).sum())
@@ -291,9 +293,18 @@ def closed_loop_rows(planners: Sequence[str], seeds: Sequence[int], runs: int) -
     table(f"4. Closed loop along a wall, 15 s, tau 10 s, {total} missions a row", head, rows)
 
 
+def chance(word: str) -> float:
+    """A risk that may be asked for."""
+    asked = float(word)
+    if not 0.0 < asked < 0.5:
+        raise argparse.ArgumentTypeError(f"{word} is not between 0 and 0.5")
+    return asked
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seeds", choices=BLOCKS, default="development")
+    parser.add_argument("--asked", type=chance, nargs="+", default=ASKED, help="risks asked for, 0 to 0.5")
     parser.add_argument("--missions", type=int, default=20_000, help="of the held point, tables 1 and 2")
     parser.add_argument("--solids", type=int, default=2000, help="of the held point, table 3")
     parser.add_argument("--flights", type=int, default=1000, help="in the closed loop; 0 for none")
@@ -305,12 +316,14 @@ def main() -> int:
     print(f"Seeds {seeds.start}-{seeds.stop - 1} ({arguments.seeds}); brackets: 95 % intervals")
     runs = arguments.missions // len(seeds)
     draws = {tau: drawn(seeds, runs, tau) for tau in TIMES}
-    wall_rows(draws)
+    wall_rows(draws, arguments.asked)
     few = len(seeds) * (arguments.solids // len(seeds))
-    solid_rows({tau: Draws(all_.error[:few], all_.sigma[:few]) for tau, all_ in draws.items()})
+    some = {tau: Draws(all_.error[:few], all_.sigma[:few]) for tau, all_ in draws.items()}
+    solid_rows(some, arguments.asked)
     if arguments.flights:
         blocks = min(len(seeds), 10)
-        closed_loop_rows(arguments.planners.split(","), seeds[:blocks], arguments.flights // blocks)
+        flown = seeds[:blocks], arguments.flights // blocks
+        closed_loop_rows(arguments.planners.split(","), arguments.asked, *flown)
     return 0
 
 

@@ -26,6 +26,18 @@ def compiled_bare(function: F) -> F:
     handing over named tuples: field by field, seven words an array and more. What such a function calls is
     compiled so as well.
     """
+    return _bare(function, inside=True)
+
+
+def compiled_apart(function: F) -> F:
+    """The same without reference counts, called as it is: for what is long, or called but now and then.
+
+    Put into its callers it would be compiled again with each of them.
+    """
+    return _bare(function, inside=False)
+
+
+def _bare(function: F, inside: bool) -> F:
     # Not among the options that numba's types know.
-    bare: dict[str, Any] = {"_nrt": False, "forceinline": True}
+    bare: dict[str, Any] = {"_nrt": False, "forceinline": inside}
     return cast(F, numba.njit(cache=True, nogil=True, error_model="numpy", **bare)(function))

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled, compiled_bare
+from napf_mpc.jit import compiled, compiled_apart, compiled_bare
 from napf_mpc.planners.guide_clearance import Sight
 from napf_mpc.planners.guide_lattice import Lattice, cover
 from napf_mpc.planners.guide_prices import (
@@ -249,7 +249,7 @@ def _step_spans(spans: NDArray[np.int64], now: int, window: tuple[int, int, int,
             spans[now, v, 0], spans[now, v, 1] = max(window[2], first - 2), min(window[3], last + 2)
 
 
-@compiled_bare
+@compiled_apart
 def search_within(
     sight: Sight,
     lattice: Lattice,

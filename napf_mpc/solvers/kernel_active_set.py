@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled_bare
+from napf_mpc.jit import compiled_apart, compiled_bare
 from napf_mpc.qp import STATES, Array, Index
 from napf_mpc.solvers.kernel_rows import HIGH, LOW, WIDTH, RowPlaces
 from napf_mpc.solvers.kernel_signals import SignalMaps
@@ -319,7 +319,7 @@ def first_of(program: Program, work: WorkingSet, group: int) -> int:
     return int(n)
 
 
-@compiled_bare
+@compiled_apart
 def close_group(program: Program, work: WorkingSet, place: int) -> bool:
     """Hold an opened group's slack at zero; return whether the members stay independent."""
     group = work.opened[place]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.jit import compiled_bare
+from napf_mpc.jit import compiled_apart, compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
 from napf_mpc.solvers.kernel_active_set import (
     INFEASIBLE,
@@ -142,7 +142,7 @@ def load(maps: SignalMaps, program: Program, work: WorkingSet, lanes: Lanes, lan
             lanes.loads[maps.stage[i], maps.target[i], lane] += weight * program.number[program.u, d, row]
 
 
-@compiled_bare
+@compiled_apart
 def under_load(maps: SignalMaps, program: Program, work: WorkingSet, room: Room, lanes: Lanes) -> None:
     """Plan and exact signals under the working set's multipliers, in the only lane."""
     clear(lanes.loads)
@@ -167,7 +167,7 @@ def correct(program: Program, work: WorkingSet, room: Room) -> bool:
     return matters
 
 
-@compiled_bare
+@compiled_apart
 def solve_rows(
     maps: SignalMaps, program: Program, work: WorkingSet, room: Room, lanes: Lanes, limit: int
 ) -> int:
@@ -274,7 +274,7 @@ def guess(
     return True
 
 
-@compiled_bare
+@compiled_apart
 def again(program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room) -> bool:
     """Take a proximal step: prices from the slacks reached; return whether they had moved."""
     moved = False
@@ -360,7 +360,7 @@ def certify(
     return worst
 
 
-@compiled_bare
+@compiled_apart
 def solve_alone(
     maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room, lanes: Lanes,
     at: int, warm: bool, guess_z: Array, guess_y: Array, guess_at: int, limit: int, z: Array, y: Array,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from napf_mpc.jit import compiled_bare
+from napf_mpc.jit import compiled_apart, compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
 from napf_mpc.solvers.kernel_signals import CLOSED, GAIN, INVERSE, PULL, TO_GO, A, B, Q, R, SignalMaps
 
@@ -103,7 +103,7 @@ def take(maps: SignalMaps, lanes: Lanes, lane: int, starts: Array, references: A
             lanes.reference[k, i, lane] = references[at, k, i]
 
 
-@compiled_bare
+@compiled_apart
 def sweep(maps: SignalMaps, lanes: Lanes, loaded: bool) -> None:
     """Optimal states and inputs for the model's cost and the references, under the loads if there are any."""
     n = lanes.linear.shape[0]
@@ -172,7 +172,7 @@ def widen_bound(bounds: Array, which: int, values: Array, k: int, i: int) -> Non
         bounds[which, lane] = size if size > bounds[which, lane] else bounds[which, lane]
 
 
-@compiled_bare
+@compiled_apart
 def stationarity(maps: SignalMaps, lanes: Lanes) -> None:
     """Multipliers of the dynamics, and how well states and inputs balance model, cost and loads.
 
