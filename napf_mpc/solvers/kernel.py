@@ -22,7 +22,7 @@ from napf_mpc.solvers.kernel_rows import RowPlaces, RowTable, gather
 from napf_mpc.solvers.kernel_signals import SignalMaps, signal_maps
 from napf_mpc.solvers.kernel_sweep import Lanes
 
-CHUNK = 16
+CHUNK = 32
 """Programs solved side by side: enough to share the model's entries, few enough to stay in the cache."""
 _STATUS = {
     OPTIMAL: QpStatus.SOLVED,
