@@ -56,8 +56,8 @@ class _Home:
     """By their number."""
     single: Lanes
     """For programs that are solved alone."""
-    steady: dict[int, LinearRows]
-    """Blocks that stand in the table for all programs, by their place in the horizon."""
+    steady: dict[int, tuple[LinearRows, int]]
+    """Blocks that stand in the table, each for so many programs, by their place in the horizon."""
     outlines: list[Hashable]
     """Of the blocks of the last horizon whose shapes have been looked at, and last its own shape."""
 
@@ -87,7 +87,7 @@ class _Home:
             return False
         for n, block in enumerate(horizon.rows):
             # A steady block that stands in the table is the very one whose shape was looked at.
-            if self.steady.get(n) is not block and block.outline() != self.outlines[n]:
+            if not self.holds(n, block, 1) and block.outline() != self.outlines[n]:
                 return False
         return True
 
@@ -102,22 +102,29 @@ class _Home:
             self.lanes[count] = Lanes.empty(self.layout.stages, count)
         return self.lanes[count]
 
-    def changing(self, rows: tuple[LinearRows, ...], step_s: Array) -> list[tuple[int, int, Blocks]]:
+    def holds(self, n: int, block: LinearRows, count: int) -> bool:
+        """Whether a block stands in the table for so many programs."""
+        kept = self.steady.get(n)
+        return kept is not None and kept[0] is block and kept[1] >= count
+
+    def changing(
+        self, rows: tuple[LinearRows, ...], step_s: Array, count: int
+    ) -> list[tuple[int, int, Blocks]]:
         """Blocks that have to be gathered program by program, each with its first family and row of slacks.
 
-        Steady ones are gathered here for all programs of the table, once.
+        Steady ones are gathered here, once, for as many programs of the table as are asked for.
         """
         blocks = []
         for n, ((family, shelf), block) in enumerate(zip(self.first, rows, strict=True)):
-            if block.steady and self.steady.get(n) is block:
+            if self.holds(n, block, count):
                 continue
             self.steady.pop(n, None)
             arrays = _arrays(block)
             if block.steady:
                 self.table.sound[:] = 1
-                gather(self.table, np.zeros(CHUNK, dtype=np.int64), family, shelf, step_s, *arrays)
+                gather(self.table, np.zeros(count, dtype=np.int64), family, shelf, step_s, *arrays)
                 if self.table.sound.all():
-                    self.steady[n] = block
+                    self.steady[n] = block, count
                     continue
             blocks.append((family, shelf, arrays))
         return blocks
@@ -191,8 +198,8 @@ class KernelSolver:
         if guesses is not None:
             guess = (_plain(guesses.z).reshape(batch, n), _plain(guesses.y).reshape(batch, m))
         step_s = _plain(horizon.model.step_s)
-        blocks = home.changing(horizon.rows, step_s) if batch else []
         todo = np.arange(batch) if asked is None else np.flatnonzero(np.repeat(asked, uavs))
+        blocks = home.changing(horizon.rows, step_s, min(len(todo), CHUNK)) if len(todo) else []
         for first in range(0, len(todo), CHUNK):
             programs = todo[first : first + CHUNK]
             home.table.sound[:] = 1

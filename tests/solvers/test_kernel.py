@@ -455,10 +455,12 @@ def test_steady_rows_serve_programs_of_every_chunk_and_bad_ones_fail_all() -> No
         for block in horizon.rows
     )  # fmt: skip
     solver = make_batch_solver("kernel")
-    plain = solver.solve_batch(replace(horizon, rows=rows))
+    plain = make_batch_solver("kernel").solve_batch(replace(horizon, rows=rows))
     steady = replace(horizon, rows=tuple(replace(block, steady=True) for block in rows))
-    for _ in range(2):
-        np.testing.assert_array_equal(solver.solve_batch(steady).z, plain.z)
+    # One run after one run, then more, then all: what was read for one program must not pass for more.
+    for runs in (1, 1, 2, 12, 12):
+        active = np.arange(12) < runs
+        np.testing.assert_array_equal(solver.solve_batch(steady, active=active).z[:runs], plain.z[:runs])
     spoilt = rows[0].jac.copy()
     spoilt[:, :, 0] = np.nan
     bad = (replace(rows[0], jac=spoilt, steady=True), *steady.rows[1:])
