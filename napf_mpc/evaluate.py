@@ -269,7 +269,9 @@ class MissionScore:
             flight.reached & ~flight.failed,
             tuple(
                 "" if done else DELAYED if late and r == Reason.NONE else REASON_WORDS[Reason(r)]
-                for done, r, late in zip(flight.reached, waited, self._delayed(waited_s), strict=True)
+                for done, r, late in zip(
+                    flight.reached, waited, self._delayed(waited_s) & ~flight.holding, strict=True
+                )
             ),
             metrics,
         )

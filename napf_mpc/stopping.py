@@ -28,6 +28,7 @@ from scipy.optimize import brentq
 from scipy.special import betaln, xlog1py, xlogy
 
 from napf_mpc.errors import ProblemError
+from napf_mpc.evaluate import Outcome
 from napf_mpc.words import shown_number
 
 ALPHA = 0.05
@@ -127,7 +128,8 @@ class StoppingRule:
         rows : mapping of str to array
             Columns of :func:`napf_mpc.block.score_rows`, of all runs from 0 on without gaps.
         """
-        contact = np.asarray(rows["obstacle_contact"], dtype=bool)
+        # A mission that failed is not a safe one: a campaign must not stop because of it.
+        contact = np.asarray(rows["obstacle_contact"], dtype=bool) | (rows["outcome"] == Outcome.FAILED)
         planner = rows["planner"]
         if (planner == planner[0]).all():
             return self.met(int(contact.sum()), len(contact))

@@ -21,7 +21,7 @@ from napf_mpc.errors import ProblemError
 from napf_mpc.plot.solvers import solvers_figure
 from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import HorizonQp
-from napf_mpc.solvers import batch
+from napf_mpc.solvers import batch, solver
 from napf_mpc.solvers.batch import BatchResult, Mask, WarmStart, make_batch_solver, register_batch_solver
 from napf_mpc.solvers.solver import SolverError
 
@@ -54,6 +54,7 @@ class Liar:
 def liars(monkeypatch: pytest.MonkeyPatch) -> list[Liar]:
     """All solvers named liar that are made."""
     monkeypatch.setattr(batch, "_BATCH_FACTORIES", dict(batch._BATCH_FACTORIES))
+    monkeypatch.setattr(solver, "_NAMES", set(solver._NAMES))
     made: list[Liar] = []
 
     def make() -> Liar:

@@ -486,3 +486,21 @@ def test_observers_see_every_step_once() -> None:
     assert steps.end is not None
     progress = (steps.end - scenario.initial_state)[..., 0].mean()
     assert score.metrics["path_length_ratio"][0] == pytest.approx(steps.way / progress, rel=1e-12)
+
+
+class Hesitant(NapfPlanner):
+    """Flies as always, and says that it holds."""
+
+    def step(self, nav: NavSolution, time_s: float) -> Command:
+        command = super().step(nav, time_s)
+        return replace(command, holding=np.ones_like(command.holding))
+
+
+def test_a_run_does_not_wait_once_it_has_ended() -> None:
+    """Each run of a block arrives at its own time, and what the others wait after that is not its own."""
+    problem = load_problem("table1_8", ["mission.length_m=12", "world.count=1", "world.along_range_m=[4, 8]"])
+    flight = closed_loop(problem, Hesitant(problem), build_scenario(problem, 7, range(6)))
+    assert flight.reached.all()
+    assert len(set(flight.finish_time_s.tolist())) > 2
+    assert flight.waited_s is not None
+    np.testing.assert_allclose(flight.waited_s, flight.finish_time_s, atol=1e-9)

@@ -30,6 +30,7 @@ def session() -> dict[str, Any]:
     # Small matrices: more threads than one would only wait for each other.
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(solver, "_FACTORIES", {})
+        patch.setattr(solver, "_NAMES", set(solver._NAMES))
         patch.setattr(batch, "_BATCH_FACTORIES", {})
         for place, block in enumerate(BLOCKS):
             exec(compile(block, f"{PAGE.name}, block {place + 1}", "exec"), names)

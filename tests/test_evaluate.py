@@ -428,15 +428,17 @@ def test_outcomes_are_decided_in_their_order(
 
 
 @pytest.mark.parametrize(
-    ("waited_s", "reason", "words"),
+    ("waited_s", "holding", "reason", "words"),
     [
-        (38.1, Reason.NONE, ""),
-        (38.3, Reason.NONE, DELAYED),
-        (38.3, Reason.WAITING, REASON_WORDS[Reason.WAITING]),
+        (38.1, False, Reason.NONE, ""),
+        (38.3, False, Reason.NONE, DELAYED),
+        (38.3, False, Reason.WAITING, REASON_WORDS[Reason.WAITING]),
+        (38.3, True, Reason.NONE, ""),  # not on its way, and its planner does not say why
+        (38.3, True, Reason.NAVIGATION, REASON_WORDS[Reason.NAVIGATION]),
     ],
 )
 def test_a_late_run_that_would_have_arrived_but_for_its_waits_says_so(
-    waited_s: float, reason: Reason, words: str
+    waited_s: float, holding: bool, reason: Reason, words: str
 ) -> None:
     """After 15 s at 2 m/s the last UAV, 6.4 m behind the middle, has 76.4 m left: 38.2 s."""
     score = judged(
@@ -446,10 +448,11 @@ def test_a_late_run_that_would_have_arrived_but_for_its_waits_says_so(
             "reached": np.array([False]),
             "finish_time_s": np.array([np.nan]),
             "waited_s": np.array([waited_s]),
+            "holding": np.array([holding]),
             "reason": np.array([reason], dtype=np.int8),
         },
     )
-    assert score.outcome == (Outcome.TIMEOUT,)
+    assert score.outcome == (Outcome.HELD if holding else Outcome.TIMEOUT,)
     assert score.reason == (words,)
     assert metric(score, "waited_s") == waited_s
 

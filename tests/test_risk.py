@@ -96,6 +96,9 @@ def test_clustered_rate_at_its_ends() -> None:
     assert every.low == pytest.approx(wilson(50, 50).low)
     assert 0.0 <= one_run.low <= 0.25 <= one_run.high <= 1.0
     assert (clustered_rate(np.array([1] * 100), 1).low) == pytest.approx(wilson(100, 100).low)
+    # Of one UAV a run, runs are all there is: no wider than Wilson.
+    alone = clustered_rate(np.array([1] * 3 + [0] * 7), 1)
+    assert (alone.low, alone.high) == pytest.approx((wilson(3, 10).low, wilson(3, 10).high), rel=1e-12)
 
 
 @given(hits=st.lists(st.integers(0, 5), min_size=1, max_size=40))

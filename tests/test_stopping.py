@@ -11,8 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from napf_mpc import store
+from napf_mpc.block import lost_block
 from napf_mpc.campaign import run_campaign
 from napf_mpc.errors import ProblemError
+from napf_mpc.evaluate import Outcome
 from napf_mpc.prefix import looks
 from napf_mpc.problem_file import load_problem
 from napf_mpc.report import comparison
@@ -103,10 +105,17 @@ def test_a_rule_is_what_the_interval_says(total: int, share: float, limit: float
 def test_every_planner_has_to_meet_it() -> None:
     rule = StoppingRule(width=0.2)
     clean, mixed = np.zeros(200, dtype=bool), np.arange(200) % 2 == 0
-    name = np.repeat(["apf", "napf"], 200)
-    assert rule({"planner": name[:200], "obstacle_contact": clean})
-    assert not rule({"planner": name, "obstacle_contact": np.concatenate([clean, mixed])})
-    assert rule({"planner": name, "obstacle_contact": np.concatenate([clean, clean])})
+    name, outcome = np.repeat(["apf", "napf"], 200), np.full(400, Outcome.REACHED, dtype=object)
+    assert rule({"planner": name[:200], "obstacle_contact": clean, "outcome": outcome[:200]})
+    assert not rule({"planner": name, "obstacle_contact": np.concatenate([clean, mixed]), "outcome": outcome})
+    assert rule({"planner": name, "obstacle_contact": np.concatenate([clean, clean]), "outcome": outcome})
+
+
+def test_missions_that_failed_are_not_clean_ones() -> None:
+    rule = StoppingRule(upper=0.05)
+    for outcome in Outcome:
+        rows = lost_block(["napf"], 0, range(200), 4, outcome, "").rows
+        assert rule(rows) == (outcome is not Outcome.FAILED)
 
 
 @pytest.mark.parametrize("limits", [{"width": 0.0}, {"upper": 1.0}, {"width": float("nan")}, {"upper": -0.1}])

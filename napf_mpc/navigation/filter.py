@@ -322,7 +322,9 @@ class KalmanFilter:
         if len(self._cross):
             correlation = np.empty(sigma.shape)
             for n, (a, b) in enumerate(cross_covariance.AXIS_PAIRS):
-                correlation[..., n] = covariance[..., a, b] / (sigma[..., a] * sigma[..., b])
+                known = covariance[..., a, b] / (sigma[..., a] * sigma[..., b])
+                # That of a fix that is refused may be no number, and nothing would get it out again.
+                correlation[..., n] = np.where(np.isfinite(known), known, 0.0)
             cross_covariance.advance_axes(self._cross, self._carried, self._response, correlation, active)
 
     def solution(self, time_s: float, attitude: Array, body_rates: Array) -> NavSolution:

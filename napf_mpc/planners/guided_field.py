@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_settings import GuidanceSettings
 from napf_mpc.planners.plan import stage_grid
 from napf_mpc.planners.planner import Command, Reason
-from napf_mpc.planners.potential_field import PotentialFieldPlanner
+from napf_mpc.planners.potential_field import PotentialFieldPlanner, lost_reasons
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.world.obstacles import ObstacleSet
@@ -116,8 +115,9 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
             yaw=np.full(trusted.shape, self._frame.heading_rad),
             holding=~trusted | held,
             feedforward=np.zeros((*trusted.shape, 4)),
+            reason=np.maximum(waiting_reasons(guide), lost_reasons(trusted)),
         )
-        return replace(self._hold(self._wait(command, nav), trusted), reason=waiting_reasons(guide))
+        return self._hold(self._wait(command, nav), trusted)
 
 
 def waiting_reasons(guide: Guide) -> NDArray[np.int8]:

@@ -14,7 +14,7 @@ from napf_mpc.formation import PathFrame, formation_offsets, reference_speed, sy
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.descent import DESCENT_MPS, Descent
-from napf_mpc.planners.planner import Command
+from napf_mpc.planners.planner import Command, Reason
 from napf_mpc.planners.tally import Event, Tally
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.safety_distance import Inflation
@@ -105,6 +105,7 @@ class PotentialFieldPlanner:
             yaw=np.full(trusted.shape, self._frame.heading_rad),
             holding=~trusted,
             feedforward=np.zeros((*trusted.shape, 4)),
+            reason=lost_reasons(trusted),
         )
         return self._hold(self._wait(command, nav), trusted)
 
@@ -183,12 +184,14 @@ class PotentialFieldPlanner:
             return command
         waits = np.broadcast_to(nav.disputed.any(-1, keepdims=True), nav.disputed.shape)
         stopped = waits[..., None]
+        assert command.reason is not None
         return replace(
             command,
             position=np.where(stopped, self._anchor, command.position),
             velocity=np.where(stopped, 0.0, command.velocity),
             direction=np.where(stopped, 0.0, command.direction),
             holding=command.holding | waits,
+            reason=np.maximum(command.reason, np.int8(Reason.WAITING) * waits),
         )
 
     def _hold(self, command: Command, trusted: NDArray[np.bool_]) -> Command:
@@ -206,6 +209,11 @@ class PotentialFieldPlanner:
             velocity=np.where(lost, DESCENT_MPS * down, command.velocity),
             direction=np.where(lost, down, command.direction),
         )
+
+
+def lost_reasons(trusted: NDArray[np.bool_]) -> NDArray[np.int8]:
+    """Codes of :class:`~napf_mpc.planners.planner.Reason` for UAVs whose navigation may not be trusted."""
+    return np.where(trusted, Reason.NONE, Reason.NAVIGATION).astype(np.int8)
 
 
 class ApfPlanner(PotentialFieldPlanner):

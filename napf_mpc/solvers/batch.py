@@ -32,6 +32,7 @@ from napf_mpc.solvers.solver import (
     backend_maker,
     solve_safely,
     solver_names,
+    take_name,
 )
 from napf_mpc.vehicle.plant import plain
 
@@ -305,8 +306,7 @@ def register_batch_solver(name: str, factory: Callable[..., BatchSolver]) -> Non
     SolverError
         If the name is taken.
     """
-    if name in batch_solver_names():
-        raise SolverError(f"a solver named {name!r} exists already")
+    take_name(name)
     _BATCH_FACTORIES[name] = factory
 
 

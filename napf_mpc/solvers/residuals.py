@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from napf_mpc.jit import compiled
+from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.quadratic_program import Array, Index, Sparsity, Values
 
 Listed = tuple[Index, Index, Index, Index, Array, Array, Array, Array, Array, Array, Array]
@@ -34,7 +34,8 @@ def kkt_residuals(sparsity: Sparsity, values: Values, z: Array, y: Array) -> tup
     values : Values
         Numbers (run, uav, ...).
     z, y : array, shapes (run, uav, n) and (run, uav, m)
-        Points and multipliers; a program with a number that is not finite gets infinite residuals.
+        Points and multipliers; a program with a number that is not finite, there or among its own (but for
+        bounds that do not exist), gets infinite residuals.
 
     Returns
     -------
@@ -46,6 +47,12 @@ def kkt_residuals(sparsity: Sparsity, values: Values, z: Array, y: Array) -> tup
     _residuals(*_listed(sparsity, values, z, y), out)
     primal, dual, complementarity = out.T.reshape(3, *batch)
     return primal, dual, complementarity
+
+
+@compiled_bare
+def _is_row(lower: float, value: float, upper: float) -> bool:
+    """Whether a row has a value and bounds; these may be infinite."""
+    return bool(np.isfinite(value)) and not (np.isnan(lower) or np.isnan(upper))
 
 
 @compiled
@@ -67,10 +74,11 @@ def _residuals(
             for k in range(a_starts[j], a_starts[j + 1]):
                 gradient += a[i, k] * y[i, a_rows[k]]
                 rows[a_rows[k]] += a[i, k] * z[i, j]
+            finite = finite and np.isfinite(gradient)
             dual = max(dual, abs(gradient))
         for r in range(m):
             multiplier = y[i, r]
-            finite = finite and np.isfinite(multiplier)
+            finite = finite and np.isfinite(multiplier) and _is_row(lower[i, r], rows[r], upper[i, r])
             over, under = rows[r] - upper[i, r], lower[i, r] - rows[r]
             primal = max(primal, over, under)
             gap = over if multiplier > 0.0 else under
@@ -90,7 +98,8 @@ def relative_residuals(sparsity: Sparsity, values: Values, z: Array, y: Array) -
     values : Values
         Numbers (run, uav, ...).
     z, y : array, shapes (run, uav, n) and (run, uav, m)
-        Points and multipliers; a program with a number that is not finite gets infinity.
+        Points and multipliers; a program with a number that is not finite, there or among its own (but for
+        bounds that do not exist), gets infinity.
 
     Returns
     -------
@@ -134,7 +143,7 @@ def _relative(
             dual = max(dual, abs(gradient))
         for r in range(m):
             multiplier = y[i, r]
-            finite = finite and np.isfinite(multiplier)
+            finite = finite and np.isfinite(multiplier) and _is_row(lower[i, r], rows[r], upper[i, r])
             low = abs(lower[i, r]) if np.isfinite(lower[i, r]) else 0.0
             high = abs(upper[i, r]) if np.isfinite(upper[i, r]) else 0.0
             over, under = rows[r] - upper[i, r], lower[i, r] - rows[r]

@@ -84,6 +84,8 @@ _SHIPPED = {
     ),
 }
 """Name -> module, imported on use, and what to install for it."""
+_NAMES = {*_SHIPPED, "kernel"}
+"""Names that are taken, those of the shipped solvers of horizons among them."""
 
 
 def register_solver(name: str, factory: Callable[..., MakeBackend]) -> None:
@@ -102,9 +104,21 @@ def register_solver(name: str, factory: Callable[..., MakeBackend]) -> None:
     SolverError
         If the name is taken.
     """
-    if name in _FACTORIES or name in _SHIPPED:
-        raise SolverError(f"a solver named {name!r} exists already")
+    take_name(name)
     _FACTORIES[name] = factory
+
+
+def take_name(name: str) -> None:
+    """Take a name for a solver, of plain programs or of horizons.
+
+    Raises
+    ------
+    SolverError
+        If it is taken.
+    """
+    if name in _NAMES:
+        raise SolverError(f"a solver named {name!r} exists already")
+    _NAMES.add(name)
 
 
 def solver_names() -> tuple[str, ...]:

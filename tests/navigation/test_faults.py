@@ -3,11 +3,21 @@
 In short what ``benchmarks/navigation_faults.py`` measures at length.
 """
 
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from navigation_faults import FAULTS, Flown, flags, fly, median_interval
+from numpy.typing import NDArray
+
+from napf_mpc.closed_loop import build_scenario, closed_loop
+from napf_mpc.navigation import filtered
+from napf_mpc.navigation.fix import Fix
+from napf_mpc.navigation.solution import NavSolution
+from napf_mpc.planners.registry import make_planner
+from napf_mpc.problem_file import load_problem
 
 RUNS = 3
 # Fault -> what must flag it in every run. Two need not be told by anything: a constant lag is an error like
@@ -77,3 +87,42 @@ def test_the_interval_of_a_median_is_that_of_order_statistics() -> None:
 def test_a_fix_that_is_no_measurement_costs_what_an_outage_costs(kind: str) -> None:
     """It is refused and counted, and no reason to throw away what the filter knows."""
     np.testing.assert_array_equal(flown(kind).watch.largest_error_m, flown("outage_5").watch.largest_error_m)
+
+
+@pytest.mark.parametrize("fault", ["nan", "zero", "negative", "asymmetric"])
+def test_one_such_fix_of_a_receiver_whose_axes_are_correlated_is_forgotten(
+    fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What axes have in common is carried on from fix to fix: one that is no number must not get into it."""
+    problem = load_problem(
+        "street_canyon_gnss", {"navigation.filter": "kalman", "simulation.time_limit_s": 4.0}
+    )
+    sources, trusted = filtered.fixes_of_flight, []
+
+    class OneBad:
+        def __init__(self, errors: Any) -> None:
+            self._source = sources(errors)
+
+        def fix(self, epoch: int, position: NDArray[np.float64]) -> Fix:
+            fix = self._source.fix(epoch, position)
+            covariance = fix.covariance.copy()
+            if epoch == 10:
+                covariance[:, 0] *= {"nan": np.nan, "zero": 0.0, "negative": -1.0}.get(fault, 1.0)
+                covariance[:, 0, 0, 1] += 5.0 * (fault == "asymmetric")
+            return replace(fix, covariance=covariance)
+
+    class Look:
+        def moved(self, *_: object) -> None:
+            pass
+
+        def ticked(self, time_s: float, state: object, nav: NavSolution, *_: object) -> None:
+            trusted.append(nav.trusted())
+            assert np.isfinite(nav.covariance).all()
+
+    monkeypatch.setattr(filtered, "fixes_of_flight", OneBad)
+    flight = closed_loop(
+        problem, make_planner("napf", problem), build_scenario(problem, 300, range(2)), [Look()]
+    )
+    assert flight.gated_fixes is not None
+    assert (flight.gated_fixes > 0).all()
+    assert np.array(trusted).all()

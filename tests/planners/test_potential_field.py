@@ -12,7 +12,7 @@ from napf_mpc.apf import repulsion
 from napf_mpc.errors import ProblemError
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.guided_field import GuidedNapfPlanner
-from napf_mpc.planners.planner import Command
+from napf_mpc.planners.planner import Command, Reason
 from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner, PotentialFieldPlanner
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
@@ -411,12 +411,17 @@ def test_a_formation_waits_for_a_uav_in_dispute_but_others_do_not(make: type[Pot
     planner.reset(ObstacleSet.empty(), 2)
     command = planner.step(replace(nav, available=~disputed, disputed=disputed), 0.0)
     assert command.holding.tolist() == [[True] * 4, [False] * 4]
+    assert command.reason is not None
+    waits, none, lost = Reason.WAITING, Reason.NONE, Reason.NAVIGATION
+    assert command.reason.tolist() == [[waits, waits, lost, waits], [none] * 4]
     assert (command.velocity[0] == 0.0).all()
     assert (np.linalg.norm(command.velocity[1], axis=-1) > 1.0).all()
     # Without a dispute, one that is not available holds alone.
     planner.reset(ObstacleSet.empty(), 2)
     alone = planner.step(replace(nav, available=~disputed), 0.0)
     assert alone.holding.sum() == 1
+    assert alone.reason is not None
+    assert alone.reason.tolist() == [[none, none, lost, none], [none] * 4]
 
 
 def test_an_obstacle_is_not_forgotten_for_want_of_a_sigma() -> None:

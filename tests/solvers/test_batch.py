@@ -20,10 +20,11 @@ from napf_mpc.solvers.batch import (
     BatchResult,
     PerUavSolver,
     WarmStart,
+    batch_solver_names,
     make_batch_solver,
     register_batch_solver,
 )
-from napf_mpc.solvers.residuals import kkt_residuals
+from napf_mpc.solvers.residuals import kkt_residuals, relative_residuals
 from napf_mpc.solvers.solver import Answer, SolverError, Warm, backend_maker, make_solver, register_solver
 from napf_mpc.vehicle.quadrotor import discretize, hover_input, linearize, mixer_inverse, rotor_limit
 
@@ -408,6 +409,21 @@ def test_residuals_of_a_number_that_is_not_finite_are_infinite(bad: float) -> No
         np.testing.assert_array_equal(residual, np.inf)
 
 
+@pytest.mark.parametrize("name", ["p", "q", "a", "lower", "upper"])
+def test_a_program_with_a_number_that_is_none_has_no_residuals(name: str) -> None:
+    """A comparison with NaN is false: unasked, its rows would pass as met and its gradient as zero."""
+    horizon = flight(1, 2, 6)
+    layout, result = Layout.of(horizon), make_batch_solver("osqp").solve_batch(horizon)
+    values = layout.values(horizon)
+    spoilt = getattr(values, name).copy()
+    spoilt[0, 1, -1] = np.nan
+    bad = replace(values, **{name: spoilt})
+    relative = relative_residuals(layout.sparsity, bad, result.z, result.y)
+    for residual in (*kkt_residuals(layout.sparsity, bad, result.z, result.y), relative):
+        assert np.isfinite(residual[0, 0])
+        assert residual[0, 1] == np.inf
+
+
 def test_warm_start_saves_iterations_and_skips_what_failed() -> None:
     solver, horizon = make_batch_solver("osqp"), flight(2, 2, 4)
     cold = solver.solve_batch(horizon)
@@ -576,6 +592,7 @@ def test_limits_that_make_no_sense_are_refused(matrix: Array, lower: Array, uppe
 def test_own_solvers_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("napf_mpc.solvers.solver._FACTORIES", {})
     monkeypatch.setattr("napf_mpc.solvers.batch._BATCH_FACTORIES", {})
+    monkeypatch.setattr("napf_mpc.solvers.solver._NAMES", set(batch_solver_names()))
     register_solver("test_stub", lambda **settings: lambda sparsity: Stub(sparsity, claims(0.0)))
     assert not accepted(make_batch_solver("test_stub").solve_batch(flight(1, 1)), LIMITS).any()
 
@@ -591,8 +608,11 @@ def test_own_solvers_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert accepted(make_batch_solver("test_structured").solve_batch(flight(1, 1)), LIMITS).all()
     with pytest.raises(SolverError, match="'test_structured' is not known"):
         make_solver("test_structured")
-    with pytest.raises(SolverError, match="exists already"):
-        register_batch_solver("test_structured", Structured)
+    for name in ("test_structured", "test_stub", "kernel", "osqp"):
+        with pytest.raises(SolverError, match=f"{name!r} exists already"):
+            register_batch_solver(name, Structured)
+        with pytest.raises(SolverError, match=f"{name!r} exists already"):
+            register_solver(name, lambda: lambda sparsity: Stub(sparsity, claims(0.0)))
     with pytest.raises(SolverError, match=r"choose from osqp.*test_structured"):
         make_batch_solver("nothing")
     with pytest.raises(SolverError, match="test_structured"):
