@@ -28,11 +28,12 @@ from scipy.optimize import brentq
 from scipy.special import betaln, xlog1py, xlogy
 
 from napf_mpc.errors import ProblemError
-from napf_mpc.evaluate import Outcome
 from napf_mpc.words import shown_number
 
 ALPHA = 0.05
 """Chance that the sequence of intervals ever misses the true rate, at most."""
+FAILED = "failed"
+"""Outcome of a mission whose numbers stopped being finite, as rows of runs have it."""
 MIXTURE = (0.5, 0.5)
 """Parameters a, b of the Beta law over which the likelihood is mixed."""
 
@@ -129,7 +130,7 @@ class StoppingRule:
             Columns of :func:`napf_mpc.block.score_rows`, of all runs from 0 on without gaps.
         """
         # A mission that failed is not a safe one: a campaign must not stop because of it.
-        contact = np.asarray(rows["obstacle_contact"], dtype=bool) | (rows["outcome"] == Outcome.FAILED)
+        contact = np.asarray(rows["obstacle_contact"], dtype=bool) | (rows["outcome"] == FAILED)
         planner = rows["planner"]
         if (planner == planner[0]).all():
             return self.met(int(contact.sum()), len(contact))
