@@ -133,7 +133,7 @@ class MissionScore:
         self._ticks = 0
 
     def _last_obstacle_along(self) -> Array:
-        """Along-track place (run,) where the last obstacle in the formation's corridor ends; NaN if none."""
+        """Along-track place (run,) where the last obstacle to be passed in the corridor ends; NaN if none."""
         obstacles, runs = self._scenario.obstacles, len(self._scenario.runs)
         length, reach = formation_mission(self._problem).length_m, self._problem.planner.influence_m
         ends_of_path = np.array([[(0.0, 0.0, 0.0)], [(length, 0.0, 0.0)]])
@@ -141,7 +141,8 @@ class MissionScore:
         heights = self._frame.to_world(slots)[..., 2]
         half_width = np.abs(self._offsets[:, 1]).max()
         low, high = _seen_from_path(obstacles.solids, self._frame)
-        met = (low[:, 0] <= length) & (high[:, 0] >= 0.0)
+        # What ends beyond the finish nobody has passed before the mission is over.
+        met = (high[:, 0] >= 0.0) & (high[:, 0] <= length)
         met &= (low[:, 1] <= half_width + reach) & (high[:, 1] >= -half_width - reach)
         met &= (low[:, 2] <= heights.max() + reach) & (high[:, 2] >= heights.min() - reach)
         scene = np.repeat(np.arange(obstacles.n_scenes), obstacles.counts())

@@ -266,7 +266,8 @@ HOUSE = Prism((np.array([(20.0, -3.0), (33.0, -3.0), (33.0, 5.0), (20.0, 5.0)]),
         ([Cylinder((30.0, 0.0), 2.0)], 32.0),
         ([TURNED], 30.0 + math.sqrt(50.0)),
         ([HOUSE], 33.0),
-        # Beside the corridor of 6.4 + 3 m, over it, under it, behind the start or beyond the end.
+        # Beside the corridor of 6.4 + 3 m, over it, under it, behind the start, beyond the end or across it.
+        ([Sphere((30.0, 1.0, 0.0), 1.5), Sphere((99.0, 1.0, 0.0), 2.0)], 31.5),
         ([Sphere((30.0, 1.0, 0.0), 1.5), Sphere((40.0, 12.0, 0.0), 2.0)], 31.5),
         ([Sphere((30.0, 1.0, 0.0), 1.5), Sphere((40.0, 11.0, 0.0), 2.0)], 42.0),
         ([Sphere((30.0, 1.0, 0.0), 1.5), Sphere((40.0, 0.0, 6.0), 2.0)], 31.5),
