@@ -372,6 +372,34 @@ def extra_distance(extra_m: float, extra_sigmas: float | None, sigma: Array) -> 
     return extra_m if extra_sigmas is None else np.minimum(extra_m, extra_sigmas * sigma)
 
 
+def check_opening(opening_mps: float | None) -> None:
+    """Raise ConstraintError unless a speed at which something is left is one, or None."""
+    if opening_mps is not None and not opening_mps > 0.0:
+        raise ConstraintError(f"opening_mps = {opening_mps!r}, must be > 0, or None")
+
+
+def opening_distance(asked: Array, here: Array, opening_mps: float | None, times_s: Array) -> Array:
+    """Distances asked for, or what opens at a speed until then, where the distance now is short.
+
+    Parameters
+    ----------
+    asked, here : array, shapes (run, uav, N, m)
+        Distance asked for, and from where the plan begins [m].
+    opening_mps : float or None
+        Speed; None asks at once [m/s].
+    times_s : array, shape (N,)
+        Ends of the stages [s].
+
+    Returns
+    -------
+    array, shape (run, uav, N, m)
+        [m].
+    """
+    if opening_mps is None:
+        return asked
+    return np.asarray(np.minimum(asked, np.minimum(asked, here) + opening_mps * times_s[:, None]))
+
+
 @dataclass(frozen=True)
 class ObstacleContact(_Shell):
     """Contact shell: stay k sigma clear of the surface, ``rho_bar >= extra``.
@@ -396,8 +424,7 @@ class ObstacleContact(_Shell):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_extra(self.extra_m, self.extra_sigmas)
-        if self.opening_mps is not None and not self.opening_mps > 0.0:
-            raise ConstraintError(f"opening_mps = {self.opening_mps!r}, must be > 0, or None")
+        check_opening(self.opening_mps)
 
     @property
     def name(self) -> str:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from napf_mpc.constraints.clearance import check_opening, opening_distance
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.problem import FormationMission, Vehicle
 from napf_mpc.safety_distance import Inflation
@@ -45,6 +46,11 @@ def _soft(horizon: Horizon, count: int, w1: float, w2: float) -> tuple[Array, Ar
 
 def _everywhere(horizon: Horizon, values: Array) -> Array:
     return np.array(np.broadcast_to(values, (*horizon.shape, *values.shape)))
+
+
+def _along(jac: Array, horizon: Horizon) -> Array:
+    """Values (run, uav, N, m) of rows of the position where plans begin [m]."""
+    return np.asarray(np.einsum("ruknd,rud->rukn", jac, horizon.position[:, :, 0]))
 
 
 class _Steady:
@@ -162,6 +168,9 @@ class AltitudeBand:
     inflation: Inflation | None = None
     """Keep k sigma clear of both; None holds the estimate inside. A band narrower than twice the margin
     shrinks to its middle."""
+    opening_mps: float | None = None
+    """A UAV that is outside now is asked to come in at this speed, not at once: the price of tens of metres
+    would buy a dash. None asks at once [m/s]."""
     w1: float = PLACE_W1
     """Linear price of a slack [1/(m s)]."""
     w2: float = PLACE_W2
@@ -172,6 +181,7 @@ class AltitudeBand:
             raise ConstraintError(f"min_m = {self.min_m!r} must be below max_m = {self.max_m!r}")
         if math.isinf(self.min_m) and math.isinf(self.max_m):
             raise ConstraintError("give min_m, max_m or both: a band without either is none")
+        check_opening(self.opening_mps)
 
     @property
     def name(self) -> str:
@@ -186,11 +196,16 @@ class AltitudeBand:
             margin = self.inflation.margin(horizon.covariance, jac)
         margin = np.minimum(margin, 0.5 * (self.max_m - self.min_m))
         lower, upper = self.min_m + margin, self.max_m - margin
+        # A margin that fills the band may leave them a digit the wrong way round.
+        lower, upper = np.minimum(lower, upper), np.maximum(lower, upper)
+        here, times_s = _along(jac, horizon), np.cumsum(horizon.step_s)
         return LinearRows(
             "position",
             jac,
-            np.minimum(lower, upper) if math.isfinite(self.min_m) else None,
-            np.maximum(lower, upper) if math.isfinite(self.max_m) else None,
+            opening_distance(lower, here, self.opening_mps, times_s) if math.isfinite(self.min_m) else None,
+            -opening_distance(-upper, -here, self.opening_mps, times_s)
+            if math.isfinite(self.max_m)
+            else None,
             *_soft(horizon, 1, self.w1, self.w2),
         )
 
@@ -203,6 +218,9 @@ class Geofence:
     """Corners (east, north) in order, either way round [m]."""
     inflation: Inflation | None = None
     """Keep k sigma and the UAV's radius clear of the fence; None holds the estimate of the centre inside."""
+    opening_mps: float | None = None
+    """A UAV that is outside now is asked to come in at this speed, not at once: the price of tens of metres
+    would buy a dash. None asks at once [m/s]."""
     w1: float = PLACE_W1
     """Linear price of a slack [1/(m s)]."""
     w2: float = PLACE_W2
@@ -210,6 +228,7 @@ class Geofence:
 
     def __post_init__(self) -> None:
         inward_normals(self.corners_m)
+        check_opening(self.opening_mps)
 
     @property
     def name(self) -> str:
@@ -224,6 +243,8 @@ class Geofence:
         if self.inflation is not None:
             radius = horizon.problem.vehicle.radius_m
             lower = lower + radius + self.inflation.margin(horizon.covariance, jac)
+        here, times_s = _along(jac, horizon), np.cumsum(horizon.step_s)
+        lower = opening_distance(lower, here, self.opening_mps, times_s)
         return LinearRows("position", jac, lower, None, *_soft(horizon, len(level), self.w1, self.w2))
 
 

@@ -17,7 +17,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.constraints.clearance import CONTACT_W1, CONTACT_W2, check_extra, extra_distance
+from napf_mpc.constraints.clearance import (
+    CONTACT_W1,
+    CONTACT_W2,
+    check_extra,
+    check_opening,
+    extra_distance,
+    opening_distance,
+)
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.safety_distance import Inflation
@@ -44,6 +51,9 @@ class MovingObstacleContact:
     """Distance kept on top of the margin [m], ..."""
     extra_sigmas: float | None = None
     """... or this many sigmas of the distance, if that is less. None keeps ``extra_m``."""
+    opening_mps: float | None = None
+    """A UAV that is inside a margin now, as it will be at a stage, is asked to leave it at this speed, not at
+    once: what is asked for faster than a UAV flies buys a dash and nothing else. None asks at once [m/s]."""
     w1: float = CONTACT_W1
     """Linear price of the slack [1/(m s)]."""
     w2: float = CONTACT_W2
@@ -55,6 +65,7 @@ class MovingObstacleContact:
                 f"obstacles = {self.obstacles!r} and reach_m = {self.reach_m!r}: must be >= 1 and > 0"
             )
         check_extra(self.extra_m, self.extra_sigmas)
+        check_opening(self.opening_mps)
 
     @property
     def name(self) -> str:
@@ -62,7 +73,7 @@ class MovingObstacleContact:
         return "moving obstacle contact"
 
     def rows(self, horizon: Horizon) -> LinearRows:
-        """Rows ``n^T p >= n^T p_lin - rho_bar(p_lin) + extra - s`` [m]."""
+        """Rows ``n^T p >= n^T p_lin - rho_bar(p_lin) + extra - s`` or, where they open first, less [m]."""
         shape = (*horizon.shape, self.obstacles)
         jac, lower = np.zeros((*shape, 3)), np.full(shape, -np.inf)
         tracks = horizon.tracks
@@ -70,11 +81,14 @@ class MovingObstacleContact:
             inflation = self.inflation or Inflation.of_problem(horizon.problem)
             normal, shifted = self._nearest(horizon, tracks, inflation)
             found = shifted.shape[-1]
-            along = np.zeros(shifted.shape)
+            along, begun = np.zeros(shifted.shape), np.zeros(shifted.shape)
             for axis in range(3):
                 along += normal[..., axis] * horizon.position[..., None, axis]
+                begun += normal[..., axis] * horizon.position[:, :, :1, None, axis]
+            here, times_s = shifted + (begun - along), np.cumsum(horizon.step_s)
+            asked = opening_distance(np.zeros(shifted.shape), here, self.opening_mps, times_s)
             jac[..., :found, :] = normal
-            lower[..., :found] = along - shifted
+            lower[..., :found] = along + (asked - shifted)
         slack = (*horizon.shape, 1)
         return LinearRows(
             "position", jac, lower, None, np.full(slack, self.w1), np.full(slack, self.w2), shared_slack=True

@@ -97,14 +97,19 @@ def default_constraints(problem: Problem) -> list[Constraint]:
         max(1, neighbours), inflation=inflation, w1=price, slot_part=SLOT_PART, opening_mps=OPENING_MPS
     )
     others: list[Constraint] = [apart] if neighbours else []
+    # Nobody is asked to get out of anything faster than it can fly: that would buy a dash and nothing else.
+    pace = problem.mission.speed_mps if isinstance(problem.mission, FormationMission) else math.inf
+    most_mps = settings.max_speed_ratio * pace
     if problem.world.moving:
         count = min(rows, len(problem.world.moving))
         extra_m, extra_sigmas = settings.contact_extra_m, settings.contact_extra_sigmas
-        moving = MovingObstacleContact(obstacles=count, w1=price, extra_m=extra_m, extra_sigmas=extra_sigmas)
+        moving = MovingObstacleContact(
+            obstacles=count, w1=price, extra_m=extra_m, extra_sigmas=extra_sigmas, opening_mps=most_mps
+        )
         others.append(moving)
     if settings.altitude_m is not None:
         low, high = settings.altitude_m
-        others.append(AltitudeBand(low, high))
+        others.append(AltitudeBand(low, high, opening_mps=pace))
     speed = SpeedLimit(w1=SPEED_PRICE[0], w2=SPEED_PRICE[1])
     return [contact, influence, *others, speed, TiltLimit(), InputBox()]
 

@@ -112,6 +112,22 @@ def test_a_band_may_be_open_on_one_side() -> None:
     assert AltitudeBand(max_m=2.0).rows(at).lower is None
 
 
+def test_who_is_outside_is_asked_in_at_a_speed() -> None:
+    """9 m under the band, 4 m over it, 6 m beside the fence; stages end after 1 and 3 s."""
+
+    def missing(constraint: Constraint, place: tuple[float, float, float]) -> Array:
+        at = replace(horizon(), step_s=np.array([1.0, 2.0]))
+        position = np.broadcast_to(np.array(place), (*at.shape, 3)).copy()
+        return constraint.rows(replace(at, position=position)).violation(position)[0, 0].max(-1)
+
+    band, fence = AltitudeBand(40.0, 60.0), Geofence(FIELD)
+    for constraint, place, whole in ((band, (0.0, 0.0, 31.0), 9.0), (band, (0.0, 0.0, 64.0), 4.0),
+                                     (fence, (36.0, 10.0, 5.0), 6.0)):  # fmt: skip
+        np.testing.assert_allclose(missing(constraint, place), whole)
+        slowly = replace(constraint, opening_mps=1.5)  # type: ignore[type-var]
+        np.testing.assert_allclose(missing(slowly, place), np.minimum(whole, (1.5, 4.5)))
+
+
 @pytest.mark.parametrize("turned", [1, -1])
 def test_the_geofence_is_in_metres_either_way_round(turned: int) -> None:
     at, fence = horizon(sigma_m=0.5), Geofence(FIELD[::turned])
@@ -186,6 +202,8 @@ def test_a_reserve_that_hover_itself_needs_is_refused() -> None:
         AltitudeBand(min_m=2.0, inflation=Inflation(3.0, reading="largest")),
         Geofence(FIELD),
         Geofence(FIELD[::-1], Inflation(3.0)),
+        AltitudeBand(-5.0, 8.0, opening_mps=2.0),
+        Geofence(FIELD, opening_mps=2.0),
         RotorLimits(),
     ],
     ids=lambda constraint: constraint.name,
@@ -204,6 +222,8 @@ def test_contract(constraint: Constraint) -> None:
         (lambda: AltitudeBand(5.0, 5.0), "min_m"),
         (lambda: AltitudeBand(np.nan, 5.0), "min_m"),
         (lambda: AltitudeBand(), "min_m"),
+        (lambda: AltitudeBand(0.0, 5.0, opening_mps=0.0), "opening_mps"),
+        (lambda: Geofence(FIELD, opening_mps=np.nan), "opening_mps"),
         (lambda: RotorLimits(0.5), "reserve"),
     ],
 )

@@ -196,3 +196,19 @@ def test_a_horizon_with_broken_tracks_is_refused() -> None:
 def test_settings_that_mean_nothing_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(ConstraintError, match=next(iter(settings))):
         MovingObstacleContact(**settings)
+
+
+def test_who_is_inside_a_margin_is_asked_out_at_a_speed() -> None:
+    """3 m inside a ball's margin at 1 m/s: 2.5 m after half a second, and all of it after three."""
+    horizon = hover_at((4.0, 0.0, 0.0), tracks_of((0.0, 0.0, 0.0)), sigma_m=2.0)
+    at_once = MovingObstacleContact(Inflation(3.0), obstacles=1)
+    slowly = replace(at_once, opening_mps=1.0)
+    # 4 m from the centre: 6 m of margin, 1 m of ball and the UAV's own radius.
+    short = 6.0 + 1.0 + RADIUS - 4.0
+    np.testing.assert_allclose(shortfall(at_once.rows(horizon), horizon.position)[:, 0], short, atol=1e-9)
+    asked = np.minimum(short, 0.5 * np.arange(1, 7))
+    np.testing.assert_allclose(shortfall(slowly.rows(horizon), horizon.position)[:, 0], asked, atol=1e-9)
+    clear = hover_at((9.0, 0.0, 0.0), tracks_of((0.0, 0.0, 0.0)), sigma_m=2.0)
+    np.testing.assert_array_equal(slowly.rows(clear).lower, at_once.rows(clear).lower)
+    with pytest.raises(ConstraintError, match=r"opening_mps = 0\.0"):
+        replace(at_once, opening_mps=0.0)

@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -721,3 +722,40 @@ def test_with_room_for_cohesion_a_formation_keeps_its_shape_better() -> None:
         path.append(flown.score.metrics["path_rms_m"])
     assert np.mean(shape[0] - shape[1]) > 0.01  # m; 0.027 when it was written
     assert 0.0 < np.mean(path[1] - path[0]) < 0.15  # m; 0.076
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"planner.altitude_m": [30.0, 60.0]},
+        {"planner.altitude_m": [-60.0, -30.0]},
+        {
+            "world": {
+                "kind": "empty",
+                "moving_sigma_m": 20.0,
+                "moving": [
+                    {
+                        "shape": "sphere",
+                        "start_m": [20.0, 3.0, 0.0],
+                        "velocity_mps": [0.0] * 3,
+                        "radius_m": 1.5,
+                    }
+                ],
+            }
+        },
+    ],
+    ids=["far below a band", "far above a band", "a track that knows next to nothing"],
+)
+def test_no_margin_buys_a_dash(settings: dict[str, Any]) -> None:
+    """Speeds stay near their bound of 3 m/s, however many metres a UAV is inside what it is to leave."""
+    given = load_problem("study_8s", {"navigation.filter": "kalman", "simulation.time_limit_s": 12.0})
+    data = json.loads(given.model_dump_json())
+    data["planner"]["altitude_m"] = settings.get("planner.altitude_m")
+    data["world"] = settings.get("world", data["world"])
+    track = simulate(
+        Problem.model_validate_json(json.dumps(data)), "qp", seed=3, runs=1, record_every=5
+    ).trajectories
+    # Take-off is a step of the references, with places that are too close to each other.
+    flying = track["t_s"] > 4.0
+    assert np.hypot(track["vx_mps"], track["vy_mps"])[flying].max() < 4.8
+    assert np.abs(track["vz_mps"])[flying].max() < 3.5
