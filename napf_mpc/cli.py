@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -81,15 +83,32 @@ def run_command(arguments: Sequence[str] | None = None) -> int:
         Instead of those that the process was started with; none at all asks for help.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a sign that a terminal does not have is no reason to fail
     try:
-        return int(app(given or ["--help"], prog_name="napf-mpc", standalone_mode=False) or 0)
+        code = int(app(given or ["--help"], prog_name="napf-mpc", standalone_mode=False) or 0)
+        if sys.stdout is not None:  # it may have been closed by whoever started this
+            sys.stdout.flush()
+        return code
     except _UsageError as error:
         _complain(error.format_message())
     except NapfError as error:
         _complain(str(error))
     except MemoryError:
         _complain("out of memory; finished blocks are kept: take a smaller problem, or fewer --workers")
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        _complain(f"standard output: {error.strerror}; what was written under --out is kept")
+        _drop_output()
     return 2
+
+
+def _drop_output() -> None:
+    """Let what is still to be printed go nowhere: the interpreter would try again when it ends."""
+    if sys.__stdout__ is not None and sys.stdout is sys.__stdout__:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())
 
 
 def _complain(text: str) -> None:

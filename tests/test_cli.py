@@ -307,12 +307,46 @@ def test_data_that_are_there_but_of_no_use_are_an_error(
     [
         "world.radius_m=[20, 20]",  # no room
         "vehicle.mass_kg=0.01",  # the inner loop would be unstable
+        'planner.solver="nosuch"',  # though the problem's own planner has none
     ],
 )
 def test_what_cannot_be_flown_is_not_valid(setting: str, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = done(capsys, "validate", "table1_40", "--set", setting)
     assert (code, out) == (2, "")
     assert err.startswith("error: ")
+
+
+def test_a_solver_that_is_not_known_is_told_with_its_key(
+    problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (("validate",), ("compare", "--planners", "apf,qp", "--runs", "1")):
+        code, out, err = done(capsys, words[0], problem, *words[1:], "--set", 'planner.solver="nosuch"')
+        assert (code, out) == (2, "")
+        assert err.startswith("error: planner.solver: ")
+        assert "'nosuch' is not known; choose from" in err
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp932"])
+def test_a_sign_that_the_output_does_not_have_is_no_reason_to_fail(problem: str, encoding: str) -> None:
+    """Redirected on a Japanese Windows, for one, standard output has no superscript two."""
+    shown = process("run", problem, env={**os.environ, "PYTHONIOENCODING": encoding}, errors="replace")
+    assert shown.returncode in (0, 1)
+    assert "N? s" in shown.stdout
+    assert shown.stderr == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no full device here")
+def test_a_full_disk_under_the_output_is_one_line() -> None:
+    with open("/dev/full", "w") as full:
+        shown = subprocess.run(
+            [sys.executable, "-m", "napf_mpc", "problems", "--schema"],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert shown.returncode == 2
+    assert (
+        shown.stderr
+        == "error: standard output: No space left on device; what was written under --out is kept\n"
+    )
 
 
 def test_quiet_prints_nothing(problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

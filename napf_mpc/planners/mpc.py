@@ -39,6 +39,7 @@ from napf_mpc.qp import STATES, HorizonQp
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
+from napf_mpc.solvers.solver import SolverError
 from napf_mpc.vehicle.plant import plain
 from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
 from napf_mpc.world.obstacles import ObstacleSet
@@ -180,8 +181,8 @@ class QpPlanner:
         self._grid = np.append(0.0, step)  # now, and the ends of the stages
         self._yaw = self._frame.heading_rad
         self._model = horizon_model(problem.vehicle, self._yaw, step, *weights(settings))
-        chosen = settings.solver if solver is None else solver
-        self._solver = make_batch_solver(chosen) if isinstance(chosen, str) else chosen
+        solver = _solver_of(problem) if solver is None else solver
+        self._solver = make_batch_solver(solver) if isinstance(solver, str) else solver
         hover = mixer_inverse(problem.vehicle) @ hover_input(problem.vehicle)
         self._limits = AcceptanceLimits.of(
             self._model, mixer_inverse(problem.vehicle), -hover, rotor_limit(problem.vehicle) - hover
@@ -456,6 +457,11 @@ class QpPlanner:
             programs = self._programs(state, reference, self._last_horizon)
             warm = None if answer is None else answer.warm_start(_moved(states, -origin), inputs)
             answer = self._answer_to(programs, warm, asked)
+            if turn + 1 < self.problem.planner.passes:
+                # The last pass is counted with what becomes of it.
+                passes.count_solves(
+                    answer.status, _COLUMN, answer.iterations, trusted, _ITERATIONS, self._counts
+                )
         assert answer is not None
         return answer
 
@@ -529,6 +535,13 @@ class QpPlanner:
         if most is None:
             return np.full(accepted.shape, np.nan)
         return most if accepted.all() else np.where(accepted, most, np.nan)
+
+
+def _solver_of(problem: Problem) -> BatchSolver:
+    try:
+        return make_batch_solver(problem.planner.solver)
+    except SolverError as error:
+        raise ProblemError("planner.solver", [str(error)]) from error
 
 
 def _causes(

@@ -153,6 +153,21 @@ def command(
 
 
 @compiled_bare
+def count_solves(
+    status: Codes, column: NDArray[np.int64], iterations: NDArray[np.int64], trusted: Mask, first: int,
+    counts: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Add the answers of a solver to the counts (column, run) of a tally; parameters as in :func:`count`."""
+    for run in range(status.shape[0]):
+        for uav in range(status.shape[1]):
+            if trusted[run, uav]:
+                where = column[status[run, uav]]
+                if where >= 0:
+                    counts[where, run] += 1
+                counts[first, run] += max(iterations[run, uav], 0)
+
+
+@compiled_bare
 def count(
     status: Codes, column: NDArray[np.int64], iterations: NDArray[np.int64], action: Codes, accepted: Mask,
     trusted: Mask, airborne: Mask, slack: Array, first: int, counts: NDArray[np.int64], largest: Array,
@@ -174,14 +189,11 @@ def count(
     first : int
         Column of the iterations, before those of refused answers and of the rungs of the ladder.
     """
+    count_solves(status, column, iterations, trusted, first, counts)
     for run in range(status.shape[0]):
         for uav in range(status.shape[1]):
             code = action[run, uav]
             if trusted[run, uav]:
-                where = column[status[run, uav]]
-                if where >= 0:
-                    counts[where, run] += 1
-                counts[first, run] += max(iterations[run, uav], 0)
                 counts[first + 1, run] += not accepted[run, uav]
             if airborne[run, uav] and code > _PLAN:
                 counts[first + 1 + code, run] += 1

@@ -126,7 +126,11 @@ class Page:
         if lines:
             y = (footer - 0.02) / (height_in + footer)
             words = "\n".join(lines)
-            figure.text(0.06 / width_in, y, words, fontsize=CREDIT_PT, color=GREY, va="top", linespacing=1.15)
+            # A file's own words: dollar signs are prices, not formulas.
+            figure.text(
+                0.06 / width_in, y, words, fontsize=CREDIT_PT, color=GREY, va="top", linespacing=1.15,
+                parse_math=False,
+            )  # fmt: skip
         return cls(figure, footer)
 
     def _fraction(
@@ -146,9 +150,9 @@ class Page:
         return self.figure.add_axes((left, bottom, width, height), **options)
 
     def text(self, x: float, y: float, words: str, **options: Any) -> Text:
-        """Text at a place [in]."""
+        """Text at a place [in], as it is: dollar signs make no formula."""
         x, y, _, _ = self._fraction(x, y, 0.0, 0.0)
-        return self.figure.text(x, y, words, **options)
+        return self.figure.text(x, y, words, parse_math=False, **options)
 
     def legend(self, handles: Sequence[Any], y: float, x: float | None = None, columns: int = 0) -> None:
         """One legend for all panels, its upper edge at a height [in], outside every frame."""

@@ -26,6 +26,7 @@ from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import HorizonQp
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
+from napf_mpc.solvers.kernel import KernelSolver
 from napf_mpc.vehicle.quadrotor import mixer_inverse, rotor_limit
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Sphere
@@ -759,3 +760,25 @@ def test_no_margin_buys_a_dash(settings: dict[str, Any]) -> None:
     flying = track["t_s"] > 4.0
     assert np.hypot(track["vx_mps"], track["vy_mps"])[flying].max() < 4.8
     assert np.abs(track["vz_mps"])[flying].max() < 3.5
+
+
+def test_every_pass_is_counted() -> None:
+    """What the solver did and what the tally says are the same numbers, however often a step is solved."""
+
+    class Counting(KernelSolver):
+        programs, changes = 0, 0
+
+        def solve_batch(
+            self, horizon: HorizonQp, warm: WarmStart | None = None, active: Any = None
+        ) -> BatchResult:
+            answer = super().solve_batch(horizon, warm, active)
+            self.programs += answer.counts()["solved"]
+            self.changes += int(answer.iterations[answer.iterations >= 0].sum())
+            return answer
+
+    given = load_problem("study_8s", {"planner.passes": 3, "simulation.time_limit_s": 5.0})
+    solver = Counting()
+    missions = simulate(given, QpPlanner(given, solver=solver), seed=1, runs=1)
+    counts = missions.tally.counts
+    assert counts["solves_solved"].sum() == solver.programs == 3 * 4 * 50
+    assert counts["iterations"].sum() == solver.changes > 0

@@ -43,7 +43,7 @@ from napf_mpc.plot.overview import overview_figure
 from napf_mpc.plot.paper import without_errors
 from napf_mpc.plot.space import space_figure
 from napf_mpc.plot.states import angle_figure, attitude_figure, axis_figure, distance_figure, motion_figure
-from napf_mpc.plot.style import FONT_PT, credit_of, house_style, uav_colour
+from napf_mpc.plot.style import FONT_PT, credit_of, house_style, save, uav_colour
 from napf_mpc.plot.tracks import SUBSTEPS, Track, acting, clearances, contacts, encounters, separations, track
 from napf_mpc.plot.trade import FINISHED, draw_fronts, fronts_figure, round_up, trade_figure
 from napf_mpc.problem import City, Problem
@@ -774,6 +774,15 @@ def test_credit_of_shared_data_is_on_the_figures(
         space_figure(shared, napf, obstacles),
     ):
         assert any(city.credit in text.get_text().replace("\n", " ") for text in figure.texts)
+
+
+def test_dollars_in_a_credit_are_prices(problem: Problem, napf: Track, tmp_path: Path) -> None:
+    """As formulas the first would be an error of the drawing, and the second would lose its signs."""
+    for credit in (r"Prices from \\host\c$\maps\d$\list", "$50 per user_seat, $99 per site_seat"):
+        shared = problem.model_copy(update={"world": City(kind="city", file="x.geojson", credit=credit)})
+        figure = motion_figure(shared, napf)
+        assert any(credit in text.get_text().replace("\n", " ") for text in figure.texts)
+        assert all(path.stat().st_size > 0 for path in save(figure, tmp_path, "credit"))
 
 
 def test_empty_worlds_lone_uavs_and_single_samples_can_be_drawn(problem: Problem) -> None:
