@@ -154,13 +154,22 @@ def draw_stored(
         raise DataError(
             f"{folder}: holds no summary.json; give a folder that run, compare or montecarlo has written"
         )
+    if not (folder / "scenario.json").is_file():
+        raise DataError(
+            f"{folder}: holds no scenario.json, without which nothing can be drawn; give a folder that run, "
+            "compare or montecarlo has written (rare keeps no missions)"
+        )
     summary = store.read_json(folder / "summary.json")
     scenario = store.read_json(folder / "scenario.json")
     try:
         problem = Problem.model_validate_json(store.to_json(scenario["problem"]))
         name, planners = str(summary["problem"]), list(summary["planners"])
     except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{folder}: its files are not of this version: {str(error)[:300]}") from error
+        what = f"no {error} in it" if isinstance(error, KeyError) else str(error)[:300]
+        raise DataError(
+            f"{folder}: its files are not of this version ({what}); "
+            "draw it with the version that wrote it, or fly it again"
+        ) from error
     store.output_folder(out)
     if "run" in summary:
         trajectories = store.read_table(folder / "trajectories.parquet")

@@ -179,9 +179,9 @@ def test_a_problem_gets_the_figures_of_the_paper(tmp_path: Path, asked: dict[str
     [
         ("summary.json", None, "holds no summary.json; give a folder that run, compare or montecarlo"),
         ("summary.json", "{", "not a readable JSON file"),
-        ("summary.json", "{}", "its files are not of this version"),
+        ("summary.json", "{}", r"its files are not of this version \(no 'problem' in it\); draw it with"),
         ("summary.json", "[]", "its files are not of this version"),
-        ("scenario.json", None, "not a readable JSON file"),
+        ("scenario.json", None, "holds no scenario.json, .* give a folder that run, compare or montecarlo"),
         ("scenario.json", '{"problem": {}}', "its files are not of this version"),
         ("runs.parquet", "PAR1", "not a readable Parquet file"),
         ("runs.parquet", None, "not a readable Parquet file"),

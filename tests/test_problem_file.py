@@ -230,6 +230,7 @@ ERRORS = '"gauss_markov", "constant", "recorded" or "gnss"'
         ("reference", REFERENCE + "{ apf = 5 } }", ".collision_risk.apf = 5: must be >= 0 and <= 1"),
         ("reference", REFERENCE + "5 }", f".collision_risk = 5: must be a table with keys out of {PLANNERS}"),
         ("planner.rate_hz", "7", " = 7 must divide 50 Hz a whole number of times"),
+        ("planner.rate_hz", "100", "which is simulation.controller_rate_hz (take 50, or change both)"),
         (
             "mission.length_m",
             "0x" + "f" * 9000,

@@ -162,15 +162,20 @@ class Problem(Section):
         """Each slower rate must divide the faster one, so that every loop is a whole number of steps."""
         faults = []
         controller_hz = self.simulation.controller_rate_hz
+        physics, controller = "1 / simulation.step_s", "simulation.controller_rate_hz"
         rates = [
-            ("simulation.controller_rate_hz", 1.0 / self.simulation.step_s, controller_hz),
-            ("planner.rate_hz", controller_hz, self.planner.rate_hz),
-            ("navigation.rate_hz", controller_hz, self.navigation.rate_hz),
+            (controller, 1.0 / self.simulation.step_s, controller_hz, physics),
+            ("planner.rate_hz", controller_hz, self.planner.rate_hz, controller),
+            ("navigation.rate_hz", controller_hz, self.navigation.rate_hz, controller),
         ]
         if self.world.moving:
-            rates.append(("world.moving_rate_hz", controller_hz, self.world.moving_rate_hz))
-        for name, fast_hz, slow_hz in rates:
+            rates.append(("world.moving_rate_hz", controller_hz, self.world.moving_rate_hz, controller))
+        for name, fast_hz, slow_hz, fast in rates:
             ratio = fast_hz / slow_hz
             if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-6 * ratio:
-                faults.append(f"{name} = {slow_hz:g} must divide {fast_hz:g} Hz a whole number of times")
+                near_hz = fast_hz / max(1, round(ratio))
+                faults.append(
+                    f"{name} = {slow_hz:g} must divide {fast_hz:g} Hz a whole number of times, "
+                    f"which is {fast} (take {near_hz:g}, or change both)"
+                )
         return faults

@@ -80,10 +80,16 @@ class PrismObstacle(Section):
     def _solid(self) -> PrismObstacle:
         if self.top_m <= self.base_m:
             raise ValueError(f"top_m = {self.top_m:g} must be > base_m = {self.base_m:g}")
+        from shapely import LinearRing  # slow to load, and few problems have prisms of their own
+
         x, y = zip(*self.footprint_m, strict=True)
         twice_area = sum(x[i - 1] * y[i] - x[i] * y[i - 1] for i in range(len(x)))
         if abs(twice_area) < 1e-6:
-            raise ValueError("footprint_m must enclose an area; its corners lie on one line")
+            raise ValueError(
+                "footprint_m must enclose an area; its corners lie on one line, or what they enclose cancels"
+            )
+        if not LinearRing(self.footprint_m).is_simple:
+            raise ValueError("footprint_m crosses or touches itself; list its corners in order around it")
         return self
 
 

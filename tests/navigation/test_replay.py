@@ -220,7 +220,7 @@ def test_starts_come_from_their_own_streams(tmp_path: Path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"file": "log.txt"}, r"must be an RTKLIB \.pos or a \.csv"),
+        ({"file": "log.txt"}, r"must be a \.csv file of errors, an RTKLIB \.pos"),
         ({"file": "log.pos"}, "truth_file"),
         ({"file": "log.csv", "truth_file": "truth.pos"}, "truth_file"),
         ({"file": "missing.csv"}, r"missing\.csv"),

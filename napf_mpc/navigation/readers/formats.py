@@ -45,8 +45,9 @@ def format_of(name: str, told: str, key: str) -> str:
         return told
     suffix = Path(name).suffix.lower()
     if suffix not in SUFFIXES:
+        errors = "a .csv file of errors, " if key == "navigation.file" else ""
         raise DataError(
-            f"{key} = {name}: must be an RTKLIB .pos or a .csv file, NMEA .nmea, u-blox .ubx or PX4 .ulg; "
+            f"{key} = {name}: must be {errors}an RTKLIB .pos, NMEA .nmea, u-blox .ubx or PX4 .ulg file; "
             f"or say which with {key.replace('file', 'format')}"
         )
     return SUFFIXES[suffix]
