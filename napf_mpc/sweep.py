@@ -130,6 +130,11 @@ def grid_points(file: str | Path, vary: Sequence[str], settings: Sequence[str] =
         raise ProblemError(
             "sweep", [f"--vary: {count} points, at most {MAX_POINTS} are flown; give fewer values"]
         )
+    both = [key for line in settings if (key := line.partition("=")[0].strip()) in grid]
+    if both:
+        raise ProblemError(
+            "sweep", [f"--set {key}: is varied, too; leave one of the two out" for key in both]
+        )
     points: list[Point] = []
     faults: dict[str, None] = {}
     source = str(file)

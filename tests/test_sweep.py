@@ -34,7 +34,8 @@ VARY = ["planner.k=1,3", "world.shape=sphere,cylinder"]
 
 
 def points(vary: list[str] = VARY) -> list[Point]:
-    return grid_points("table1_8", vary, BRIEF)
+    keys = {line.partition("=")[0] for line in vary}
+    return grid_points("table1_8", vary, [line for line in BRIEF if line.partition("=")[0] not in keys])
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +76,11 @@ def test_commas_in_brackets_and_quotes_belong_to_the_value() -> None:
 def test_lines_that_are_no_grid_are_refused(lines: list[str], told: str) -> None:
     with pytest.raises(ProblemError, match=told):
         parse_vary(lines)
+
+
+def test_a_key_is_varied_or_set() -> None:
+    with pytest.raises(ProblemError, match=r"--set planner\.k: is varied, too; leave one of the two out"):
+        grid_points("table1_8", ["planner.k=1,2"], ["world.count=3", "planner.k=3"])
 
 
 def test_every_combination_is_a_point_with_its_own_folder() -> None:
