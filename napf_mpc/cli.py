@@ -83,9 +83,8 @@ def run_command(arguments: Sequence[str] | None = None) -> int:
         Instead of those that the process was started with; none at all asks for help.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a sign that a terminal does not have is no reason to fail
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a sign that a terminal does not have is no reason to fail
     try:
         code = int(app(given or ["--help"], prog_name="napf-mpc", standalone_mode=False) or 0)
         if sys.stdout is not None:  # it may have been closed by whoever started this
