@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from napf_mpc.first_passage import first_passage_probability, long_run, mission_k
+from napf_mpc.first_passage import _CORRECTION, first_passage_probability, long_run, mission_k
 from napf_mpc.navigation.processes import gauss_markov
 
 
@@ -147,3 +147,11 @@ def test_long_run_is_exact_in_the_long_run() -> None:
 def test_what_makes_no_sense_is_refused(call, words: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ValueError, match=words):
         call()
+
+
+def test_the_correction_for_looking_at_intervals_is_chernoffs() -> None:
+    """zeta(1/2) by Euler and Maclaurin: the sum of n^(-1/2) less its integral."""
+    n = np.arange(1.0, 1_000_001.0)
+    last = n[-1]
+    zeta = math.fsum(n**-0.5) - 2.0 * math.sqrt(last) - 0.5 / math.sqrt(last)
+    assert pytest.approx(-zeta / math.sqrt(2.0 * math.pi), abs=1e-9) == _CORRECTION
