@@ -121,12 +121,17 @@ def fly(
     """
     name, own = CELLS[cell]
     problem = load_problem(name, [*own, *settings, *options.set])
-    folder = options.out / "".join(c if c.isalnum() else "_" for c in f"{cell}-{label}")
+    folder = folder_of(options.out, cell, label)
     seed = BLOCKS[options.block]
     summary = run_campaign(problem, [kind], options.runs, seed, folder, name=name, workers=workers)
     rows = store.read_table(folder / "runs.parquet")
     hits = np.asarray(rows["obstacle_contact"], dtype=bool)[np.argsort(rows["run"])]
     return Flown(cell, label, summary["planners"][kind], hits)
+
+
+def folder_of(out: Path, cell: str, label: str) -> Path:
+    """Where what was flown in a cell under a label is kept."""
+    return out / "".join(c if c.isalnum() else "_" for c in f"{cell}-{label}")
 
 
 HEAD = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -74,6 +75,10 @@ Animation = Annotated[bool, typer.Option("--animation", help="Draw an animation 
 _UsageError: Any = typer.BadParameter.__base__  # click's, wherever this version of typer keeps it
 
 
+_OUTPUT_ERRORS = (errno.ENOSPC, errno.EIO, errno.EPIPE, errno.EBADF)
+"""What writing to a stream ends with: full, broken, nobody reads it, closed."""
+
+
 def run_command(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; errors are one clear line, never a traceback.
 
@@ -98,9 +103,12 @@ def run_command(arguments: Sequence[str] | None = None) -> int:
         _complain("out of memory; finished blocks are kept: take a smaller problem, or fewer --workers")
     except OSError as error:
         if error.filename is not None:
+            _complain(f"{error.filename}: {error.strerror}; finished blocks are kept")
+        elif error.errno in _OUTPUT_ERRORS:
+            _complain(f"standard output: {error.strerror}; what was written under --out is kept")
+            _drop_output()
+        else:
             raise
-        _complain(f"standard output: {error.strerror}; what was written under --out is kept")
-        _drop_output()
     return 2
 
 

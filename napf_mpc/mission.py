@@ -17,7 +17,8 @@ from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.provenance import data_digests, identity
 from napf_mpc.scenario_file import moving_of, scenes_of, write_scenario
-from napf_mpc.solvers.batch import batch_solver_names
+from napf_mpc.solvers.batch import check_solver_name
+from napf_mpc.solvers.solver import SolverError
 from napf_mpc.summary import summarise
 from napf_mpc.words import shown_value
 from napf_mpc.world.moving import MovingObstacles
@@ -59,7 +60,10 @@ def check_mission(problem: Problem, data_folder: Path | None = None) -> str:
         If the problem cannot be flown: planner, scene, inner loop, or what is in its data files.
     """
     flies = isinstance(problem.mission, FormationMission)
-    check_solver_name(problem.planner.solver)
+    try:
+        check_solver_name(problem.planner.solver)  # whether the problem's own planner has one or not
+    except SolverError as error:
+        raise ProblemError("planner.solver", [str(error)]) from error
     try:
         data_digests(problem, data_folder)
     except DataError as missing:
@@ -71,13 +75,6 @@ def check_mission(problem: Problem, data_folder: Path | None = None) -> str:
     else:
         scenes_of(problem, data_folder=data_folder)
     return ""
-
-
-def check_solver_name(name: str) -> None:
-    """Raise ProblemError for a solver that nobody knows, whichever planner the problem is for."""
-    if name not in batch_solver_names():
-        choices = ", ".join(batch_solver_names())
-        raise ProblemError("planner.solver", [f"{name!r} is not known; choose from {choices}"])
 
 
 def fly_mission(

@@ -251,6 +251,18 @@ def test_running_out_of_memory_is_one_line(
     assert err.startswith("error: out of memory")
 
 
+def test_a_file_that_the_system_refuses_is_one_line(
+    problem: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: Any, **__: Any) -> None:
+        raise PermissionError(13, "Permission denied", "somewhere/file")
+
+    monkeypatch.setattr("napf_mpc.campaign.run_campaign", refused)
+    code, out, err = done(capsys, "compare", problem)
+    assert (code, out) == (2, "")
+    assert err == "error: somewhere/file: Permission denied; finished blocks are kept\n"
+
+
 # ------------------------------------------------------------------------------------- problems and validate
 
 

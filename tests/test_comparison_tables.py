@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from napf_mpc import store
 from napf_mpc.campaign import simulate
 from napf_mpc.problem_file import load_problem
 from napf_mpc.risk import holm, mcnemar
@@ -26,6 +27,15 @@ def comparison(monkeypatch: pytest.MonkeyPatch) -> Any:
 
     yield comparison
     del sys.modules["comparison"]
+
+
+@pytest.fixture
+def planner_settings(comparison: Any) -> Any:
+    """The module, which reads what comparison has flown."""
+    import planner_settings
+
+    yield planner_settings
+    del sys.modules["planner_settings"]
 
 
 @pytest.fixture
@@ -171,3 +181,27 @@ def test_the_table_of_wrong_sigmas_counts_first_alarms_and_bounds_medians(
         "cause": [cause, cause, cause, cause, "upset"],
     }
     assert sorted(monitor_scale.first_alarms(events)) == [20.0, 40.0, 50.0]
+
+
+def test_differences_of_settings_are_those_of_pairs_with_their_interval(
+    planner_settings: Any, tmp_path: Path
+) -> None:
+    """Runs in any order: 1 m more in each but one, which has no number; 0.1 m to and fro; nothing."""
+    run = np.arange(101)
+    path = 5.0 + np.sin(run)
+    for label, extra, order in (("as shipped", 0.0, run), ("two passes", 1.0, run[::-1])):
+        folder = planner_settings.folder_of(tmp_path, "8S filter", label)
+        folder.mkdir()
+        shape = 2.0 + extra * 0.1 * np.where(run % 2, 1.0, -1.0)
+        columns = {"path_rms_m": path + extra, "shape_rms_m": shape, "control_effort": 9.0 - path}
+        columns["path_rms_m"][100] = columns["shape_rms_m"][100] = np.nan
+        store.write_table(folder / "runs.parquet", {"run": order} | {k: v[order] for k, v in columns.items()})
+    planner_settings.SETTINGS = {"as shipped": [], "two passes": ["planner.passes=2"]}
+    *_, line = planner_settings.difference_table(tmp_path, ["8S filter"])
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    half = 1.96 * np.std([0.1, -0.1] * 50, ddof=1) / 10.0
+    assert cells == [
+        "8S filter", "two passes", "+1.000 [+1.000, +1.000]",
+        f"+0.000 [{-half:+.3f}, {half:+.3f}]", "+0.000 [+0.000, +0.000]",
+    ]  # fmt: skip
+    assert half == pytest.approx(0.0197, abs=1e-4)

@@ -315,6 +315,12 @@ def batch_solver_names() -> tuple[str, ...]:
     return tuple(dict.fromkeys((*solver_names(), *_BATCH_SHIPPED, *_BATCH_FACTORIES)))
 
 
+def check_solver_name(name: str) -> None:
+    """Raise SolverError unless :func:`make_batch_solver` knows a name, its package installed or not."""
+    if name not in batch_solver_names():
+        raise SolverError(f"solver {name!r} is not known; choose from {', '.join(batch_solver_names())}")
+
+
 def _shipped(name: str) -> Callable[..., BatchSolver]:
     module, maker = _BATCH_SHIPPED[name]
     factory: Callable[..., BatchSolver] = getattr(import_module(module), maker)
@@ -329,8 +335,7 @@ def make_batch_solver(name: str, **settings: object) -> BatchSolver:
     SolverError
         If the name is not known, its package is not installed, or a setting is not known.
     """
-    if name not in batch_solver_names():
-        raise SolverError(f"solver {name!r} is not known; choose from {', '.join(batch_solver_names())}")
+    check_solver_name(name)
     if name in _BATCH_SHIPPED or name in _BATCH_FACTORIES:
         factory = _BATCH_FACTORIES[name] if name in _BATCH_FACTORIES else _shipped(name)
         try:

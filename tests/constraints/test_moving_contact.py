@@ -52,16 +52,19 @@ def shortfall(rows: LinearRows, position: Array) -> Array:
     return rows.violation(position)[0, 0]
 
 
+@pytest.mark.parametrize("opening_mps", [None, 0.7])
 @pytest.mark.parametrize("upright", [False, True])
-def test_at_rest_and_certain_the_rows_are_those_of_obstacles_that_stand(upright: bool) -> None:
+def test_at_rest_and_certain_the_rows_are_those_of_obstacles_that_stand(
+    upright: bool, opening_mps: float | None
+) -> None:
     """400 random plans in front of, in and behind three obstacles: coefficients and bounds to 1e-9."""
     rng = generator(3, 0, Stream.SCENE)
     places = ((4.0, 1.0, 0.5), (-3.0, 5.0, 0.0), (0.0, -4.0, 1.0))
     shapes: list[Shape] = [Cylinder(p[:2], 1.0) if upright else Sphere(p, 1.0) for p in places]
     horizon = sample_horizon(rng, ObstacleSet.from_shapes(shapes), runs=17, spread_m=4.0)
     horizon = replace(horizon, tracks=tracks_of(*places, runs=17, upright=np.full(3, upright)))
-    ours = MovingObstacleContact(obstacles=3).rows(horizon)
-    theirs = ObstacleContact(obstacles=3).rows(horizon)
+    ours = MovingObstacleContact(obstacles=3, opening_mps=opening_mps).rows(horizon)
+    theirs = ObstacleContact(obstacles=3, opening_mps=opening_mps).rows(horizon)
     assert (ours.signal, ours.shared_slack) == (theirs.signal, theirs.shared_slack)
     assert ours.lower is not None
     assert theirs.lower is not None

@@ -223,6 +223,11 @@ def test_starts_come_from_their_own_streams(tmp_path: Path):
         ({"file": "log.txt"}, r"must be a \.csv file of errors, an RTKLIB \.pos"),
         ({"file": "log.pos"}, "truth_file"),
         ({"file": "log.csv", "truth_file": "truth.pos"}, "truth_file"),
+        # Errors are no places: a .csv is not among what a truth may be.
+        (
+            {"file": "log.pos", "truth_file": "truth.csv"},
+            r"truth_file = truth\.csv: must be an RTKLIB \.pos, NMEA",
+        ),
         ({"file": "missing.csv"}, r"missing\.csv"),
         ({"file": "../log.csv"}, r"\.\."),
     ],
