@@ -266,7 +266,7 @@ class Guidance:
             if self._room_m > 0.0:
                 room = room_outwards(*there, self._room_m)
             self._taut = np.concatenate([pulled, loose[..., None], room[..., None]], axis=-1)
-        self._hold(offset, elapsed_s)
+        self._hold(offset, elapsed_s, measured)
 
     def _separation(self, covariance: Array) -> Array:
         """Distances (run, uav, uav) to keep between UAVs: k sigma of both, as far as slots allow."""
@@ -274,14 +274,15 @@ class Guidance:
         wanted = self._min_separation + self._inflation.k * np.sqrt(variance[:, :, None] + variance[:, None])
         return np.minimum(wanted, self.settings.apart_share * self._slot_distance)
 
-    def _hold(self, offset: Array, elapsed_s: float) -> None:
+    def _hold(self, offset: Array, elapsed_s: float, measured: bool) -> None:
         """Decide per run how fast to go on, from what is blocked ahead and how near it is."""
         settings = self.settings
         breach = np.maximum(self._missing - settings.spare_m, 0.0)
         # Where a UAV is already inside the margin, a way that gets no worse leads out.
         here = np.maximum(breach[..., 0], breach[..., 1])
         worse = breach - here[..., None]
-        margin = self._inflation.k * rms_sigma(self._covariance).max(-1)
+        k = max(self._inflation.k, settings.measured_k) if measured else self._inflation.k
+        margin = k * rms_sigma(self._covariance).max(-1)
         scale = np.maximum(1.0, margin / settings.usual_margin_m) ** settings.tolerance_power
         distance = self._blocked_at(worse, settings.tolerance_m * scale)
         self._squeezing &= distance <= settings.stop_m + settings.slow_m

@@ -53,21 +53,24 @@ def isotropic(sigma: float, runs: int = 1) -> Array:
     return np.tile(np.eye(3) * sigma**2, (runs, 4, 1, 1))
 
 
-def guidance(shapes: list[Shape], settings: GuidanceSettings = SETTINGS, **sections: Any) -> Guidance:
-    made = Guidance(problem(**sections), Inflation(3.0), settings)
+def guidance(
+    shapes: list[Shape], settings: GuidanceSettings = SETTINGS, k: float = 3.0, **sections: Any
+) -> Guidance:
+    made = Guidance(problem(**sections), Inflation(k), settings)
     made.reset(ObstacleSet.from_shapes(shapes), 1)
     return made
 
 
 def follow(
-    made: Guidance, *, until_m: float = 110.0, time_limit_s: float = 110.0, sigma: float = 0.5
-) -> tuple[list[Array], list[Guide]]:
+    made: Guidance, *, until_m: float = 110.0, time_limit_s: float = 110.0, sigma: float = 0.5,
+    measured: bool = False,
+) -> tuple[list[Array], list[Guide]]:  # fmt: skip
     """UAVs that follow the guide as well as a vehicle of 2 m/s can: places and guides every 0.1 s."""
     place = advanced(8.0)
     covariance, trusted = isotropic(sigma), np.ones((1, 4), dtype=bool)
     places, guides = [], []
     for step in range(round(10 * time_limit_s)):
-        guide = made.step(place[None], covariance, trusted, 0.1 * step)
+        guide = made.step(place[None], covariance, trusted, 0.1 * step, measured=measured)
         places.append(place)
         guides.append(guide)
         if place[:, 0].min() >= until_m or (guide.reason == Passage.NO_PASSAGE).all():
@@ -283,6 +286,18 @@ def test_a_gap_too_narrow_for_the_margin_is_refused_or_announced() -> None:
     announced = max(float(guide.breach_m.max()) for guide in guides)
     assert announced == pytest.approx(0.5, abs=0.35)
     assert clearance(after_a_hold, places) > K_SIGMA - announced - 0.5
+
+
+@pytest.mark.parametrize(
+    ("k", "measured", "held"),
+    [(1.0, False, True), (1.0, True, False), (3.0, False, False), (3.0, True, False)],
+)
+def test_a_small_k_makes_raw_measurements_no_steadier(k: float, measured: bool, held: bool) -> None:
+    # 0.8 m too narrow on both sides: more than the 0.28 m tolerated for 3 m, less than the 2 m for 9 m.
+    sigma = 3.0
+    made = guidance(gap(2.0 * (RADIUS + k * sigma - 0.8)), k=k)
+    _, guides = follow(made, sigma=sigma, measured=measured)
+    assert (Passage.HOLD in reasons(guides)) == held
 
 
 def test_a_hold_ends_when_navigation_gets_better() -> None:
