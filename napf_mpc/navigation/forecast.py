@@ -22,6 +22,11 @@ __all__ = ["CovarianceForecast", "ForecastModel", "variance_ahead"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+LANES = 16
+"""Axes of UAVs carried side by side: each is a chain of sums that wait for each other."""
+POSITION, VELOCITY = 0, 1
+"""What a fix measures."""
+
 
 @dataclass(frozen=True, eq=False)
 class ForecastModel:
@@ -184,90 +189,109 @@ def variance_ahead(
     out : array, shape (run, uav, N, 3)
         Out [m^2].
     """
-    # Axis beside axis: each is a chain of sums that wait for each other, and three chains wait side by side.
-    c, usable = np.empty((3, kalman.PACKED)), np.empty(3, dtype=np.bool_)
-    period = drift.shape[0] - 1
-    for r in range(packed.shape[0]):
-        for i in range(packed.shape[1]):
-            for a in range(3):
-                for e in range(kalman.PACKED):
-                    c[a, e] = packed[r, i, a, e]
-            now, to_epoch, to_new = 0, ticks_to_epoch, epochs_to_new
-            for k in range(ticks.shape[0]):
-                at = min(k, sigma.shape[2] - 1)
-                for a in range(3):
-                    usable[a] = 0.0 < sigma[r, i, at, a] < np.inf
-                while now < ticks[k]:
-                    n = min(ticks[k] - now, to_epoch)
-                    for a in range(3):
-                        _drift(c, a, drift, n)
-                    now += n
-                    to_epoch -= n
-                    if to_epoch > 0:
-                        continue
-                    to_epoch = period
-                    to_new -= 1
-                    fix = fixes[r, i] and to_new == 0
-                    for a in range(3):
-                        _forget(c, a, error_memory[a], error_noise[r, i, a])
-                        if usable[a] and (fix or fixless_axis[a]):
-                            _measured(c, a, 1.0, 0.0, sigma[r, i, at, a], position_noise)
-                        if usable[a] and fix:
-                            _measured(c, a, 0.0, 1.0, 0.0, velocity_noise)
-                    if to_new == 0:
-                        to_new = epochs_per_new
-                for a in range(3):
-                    out[r, i, k, a] = c[a, 0]
+    c, error = np.empty((kalman.PACKED, LANES)), np.empty((2, LANES))
+    memory, noise = np.empty(LANES), np.empty(LANES)
+    place, used = np.empty((3, LANES), dtype=np.uint32), np.empty((2, LANES), dtype=np.bool_)
+    uavs, period = packed.shape[1], drift.shape[0] - 1
+    axes = packed.shape[0] * uavs * 3
+    error[VELOCITY] = 0.0
+    for first in range(0, axes, LANES):
+        last = min(first + LANES, axes)
+        for lane in range(LANES):
+            # Lanes that are left over do what the last axis does.
+            at = min(first + lane, last - 1)
+            r, i, a = at // (3 * uavs), at // 3 % uavs, at % 3
+            place[0, lane], place[1, lane], place[2, lane] = r, i, a
+            for e in range(kalman.PACKED):
+                c[e, lane] = packed[r, i, a, e]
+            memory[lane], noise[lane] = error_memory[a], error_noise[r, i, a]
+        now, to_epoch, to_new = 0, ticks_to_epoch, epochs_to_new
+        for k in range(ticks.shape[0]):
+            while now < ticks[k]:
+                n = min(ticks[k] - now, to_epoch)
+                _drift(c, drift, n)
+                now += n
+                to_epoch -= n
+                if to_epoch > 0:
+                    continue
+                to_epoch = period
+                to_new -= 1
+                measured = 0
+                for lane in range(LANES):
+                    r, i, a = place[0, lane], place[1, lane], place[2, lane]
+                    size = sigma[r, i, min(k, sigma.shape[2] - 1), a]
+                    usable, fix = 0.0 < size < np.inf, fixes[r, i] and to_new == 0
+                    error[POSITION, lane] = size
+                    used[POSITION, lane] = usable and (fix or fixless_axis[a])
+                    used[VELOCITY, lane] = usable and fix
+                    measured += used[POSITION, lane]
+                _forget(c, memory, noise)
+                if measured > 0:
+                    _measured(c, 1.0, 0.0, error, POSITION, position_noise, used)
+                    _measured(c, 0.0, 1.0, error, VELOCITY, velocity_noise, used)
+                if to_new == 0:
+                    to_new = epochs_per_new
+            for lane in range(last - first):
+                out[place[0, lane], place[1, lane], k, place[2, lane]] = c[0, lane]
 
 
 @compiled_bare
-def _drift(c: Array, a: int, drift: Array, n: int) -> None:
-    """Carry an axis over a number of ticks."""
+def _drift(c: Array, drift: Array, n: int) -> None:
+    """Carry all lanes over a number of ticks."""
     pv_, pb_, vb_, left = drift[n, 0], drift[n, 1], drift[n, 2], drift[n, 3]
-    pp, pv, pg, pb = c[a, 0], c[a, 1], c[a, 2], c[a, 3]
-    vv, vg, vb, gb, bb = c[a, 4], c[a, 5], c[a, 6], c[a, 8], c[a, 9]
-    # Rows first: what the new p and v have in common with the old v and b.
-    p_v, p_b = pv + pv_ * vv + pb_ * vb, pb + pv_ * vb + pb_ * bb
-    v_b = vb + vb_ * bb
-    c[a, 0] = pp + pv_ * pv + pb_ * pb + pv_ * p_v + pb_ * p_b + drift[n, 4]
-    c[a, 1] = p_v + vb_ * p_b + drift[n, 5]
-    c[a, 2] = pg + pv_ * vg + pb_ * gb
-    c[a, 3] = left * p_b + drift[n, 6]
-    c[a, 4] = vv + vb_ * vb + vb_ * v_b + drift[n, 7]
-    c[a, 5] = vg + vb_ * gb
-    c[a, 6] = left * v_b + drift[n, 8]
-    c[a, 8] = left * gb
-    c[a, 9] = left * left * bb + drift[n, 9]
+    q_pp, q_pv, q_pb, q_vv, q_vb, q_bb = (
+        drift[n, 4], drift[n, 5], drift[n, 6], drift[n, 7], drift[n, 8], drift[n, 9]
+    )  # fmt: skip
+    for lane in range(LANES):
+        pp, pv, pg, pb = c[0, lane], c[1, lane], c[2, lane], c[3, lane]
+        vv, vg, vb, gb, bb = c[4, lane], c[5, lane], c[6, lane], c[8, lane], c[9, lane]
+        # Rows first: what the new p and v have in common with the old v and b.
+        p_v, p_b = pv + pv_ * vv + pb_ * vb, pb + pv_ * vb + pb_ * bb
+        v_b = vb + vb_ * bb
+        c[0, lane] = pp + pv_ * pv + pb_ * pb + pv_ * p_v + pb_ * p_b + q_pp
+        c[1, lane] = p_v + vb_ * p_b + q_pv
+        c[2, lane] = pg + pv_ * vg + pb_ * gb
+        c[3, lane] = left * p_b + q_pb
+        c[4, lane] = vv + vb_ * vb + vb_ * v_b + q_vv
+        c[5, lane] = vg + vb_ * gb
+        c[6, lane] = left * v_b + q_vb
+        c[8, lane] = left * gb
+        c[9, lane] = left * left * bb + q_bb
 
 
 @compiled_bare
-def _forget(c: Array, a: int, memory: float, noise: float) -> None:
-    """Carry the error g from one epoch of fixes to the next."""
-    c[a, 2] *= memory
-    c[a, 5] *= memory
-    c[a, 7] = memory * memory * c[a, 7] + noise
-    c[a, 8] *= memory
+def _forget(c: Array, memory: Array, noise: Array) -> None:
+    """Carry the error g of all lanes from one epoch of fixes to the next."""
+    for lane in range(LANES):
+        c[2, lane] *= memory[lane]
+        c[5, lane] *= memory[lane]
+        c[7, lane] = memory[lane] * memory[lane] * c[7, lane] + noise[lane]
+        c[8, lane] *= memory[lane]
 
 
 @compiled_bare
-def _measured(c: Array, a: int, h_p: float, h_v: float, h_g: float, noise: float) -> None:
-    """Covariance after a measurement of ``h_p p + h_v v + h_g g``.
+def _measured(c: Array, h_p: float, h_v: float, error: Array, which: int, noise: float, used: Mask) -> None:
+    """Covariance after a measurement of ``h_p p + h_v v + h_g g``, in the lanes that use it.
 
     Shorter than the filter's own update, which must stay sound for hours; over a horizon the plain difference
     does.
     """
-    p = h_p * c[a, 0] + h_v * c[a, 1] + h_g * c[a, 2]
-    v = h_p * c[a, 1] + h_v * c[a, 4] + h_g * c[a, 5]
-    g = h_p * c[a, 2] + h_v * c[a, 5] + h_g * c[a, 7]
-    b = h_p * c[a, 3] + h_v * c[a, 6] + h_g * c[a, 8]
-    scale = 1.0 / (h_p * p + h_v * v + h_g * g + noise)
-    c[a, 0] -= scale * p * p
-    c[a, 1] -= scale * p * v
-    c[a, 2] -= scale * p * g
-    c[a, 3] -= scale * p * b
-    c[a, 4] -= scale * v * v
-    c[a, 5] -= scale * v * g
-    c[a, 6] -= scale * v * b
-    c[a, 7] -= scale * g * g
-    c[a, 8] -= scale * g * b
-    c[a, 9] -= scale * b * b
+    for lane in range(LANES):
+        h_g, use = error[which, lane], used[which, lane]
+        pp, pv, pg, pb, vv = c[0, lane], c[1, lane], c[2, lane], c[3, lane], c[4, lane]
+        vg, vb, gg, gb, bb = c[5, lane], c[6, lane], c[7, lane], c[8, lane], c[9, lane]
+        p = h_p * pp + h_v * pv + h_g * pg
+        v = h_p * pv + h_v * vv + h_g * vg
+        g = h_p * pg + h_v * vg + h_g * gg
+        b = h_p * pb + h_v * vb + h_g * gb
+        scale = 1.0 / (h_p * p + h_v * v + h_g * g + noise)
+        c[0, lane] = pp - scale * p * p if use else pp
+        c[1, lane] = pv - scale * p * v if use else pv
+        c[2, lane] = pg - scale * p * g if use else pg
+        c[3, lane] = pb - scale * p * b if use else pb
+        c[4, lane] = vv - scale * v * v if use else vv
+        c[5, lane] = vg - scale * v * g if use else vg
+        c[6, lane] = vb - scale * v * b if use else vb
+        c[7, lane] = gg - scale * g * g if use else gg
+        c[8, lane] = gb - scale * g * b if use else gb
+        c[9, lane] = bb - scale * b * b if use else bb

@@ -225,6 +225,33 @@ def test_a_sigma_that_says_nothing_measures_nothing() -> None:
         )
 
 
+def test_a_forecast_does_not_depend_on_who_stands_beside() -> None:
+    """UAVs with certainties, sigmas and outages of their own, all at once and one by one, to the last bit."""
+    forecast = Pilot(GaussMarkov()).fly(3.0)[-1].forecast
+    assert forecast is not None
+    rng = np.random.default_rng(3)
+    mixed = replace(
+        forecast,
+        packed=forecast.packed * rng.uniform(1.0, 4.0, (RUNS, UAVS, 3, 1)),
+        sigma=np.where(rng.random((RUNS, UAVS, 3)) < 0.2, np.inf, rng.uniform(0.5, 5.0, (RUNS, UAVS, 3))),
+        fixes=np.array([[True, False, True], [False, True, True]]),
+    )
+    together = mixed.variance(AHEAD_S, with_fixes=True)
+    assert len(np.unique(together[:, :, -1])) == RUNS * UAVS * 3
+    for run in range(RUNS):
+        for uav in range(UAVS):
+            at = slice(run, run + 1), slice(uav, uav + 1)
+            noise = np.broadcast_to(mixed.model.error_noise, mixed.sigma.shape)[at]
+            alone = replace(
+                mixed,
+                model=replace(mixed.model, error_noise=noise),
+                packed=mixed.packed[at].copy(),
+                sigma=mixed.sigma[at],
+                fixes=mixed.fixes[at],
+            )
+            np.testing.assert_array_equal(alone.variance(AHEAD_S, with_fixes=True), together[at])
+
+
 def test_before_the_first_fix_nothing_is_known() -> None:
     model = FilterModel.of_navigation(GaussMarkov(), TICK_S, TICKS)
     still = np.zeros((RUNS, UAVS, 3))
