@@ -90,7 +90,7 @@ class GuidanceSettings:
     """Tolerance and squeeze are for margins k sigma up to this [m]; beyond, they grow with its power ..."""
     tolerance_power: float = 1.8
     """... of this: with margins of ten metres an estimate wanders by more than what counts with two."""
-    measured_k: float = 3.0
+    measured_k: float = 4.0
     """On raw measurements they are those of this k at least: a small k makes no estimate steadier."""
     stop_m: float = 4.0
     """Distance to a blocked place at which the formation holds [m]."""

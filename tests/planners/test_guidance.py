@@ -293,7 +293,7 @@ def test_a_gap_too_narrow_for_the_margin_is_refused_or_announced() -> None:
     [(1.0, False, True), (1.0, True, False), (3.0, False, False), (3.0, True, False)],
 )
 def test_a_small_k_makes_raw_measurements_no_steadier(k: float, measured: bool, held: bool) -> None:
-    # 0.8 m too narrow on both sides: more than the 0.28 m tolerated for 3 m, less than the 2 m for 9 m.
+    # 0.8 m too narrow on both sides: above the 0.28 m tolerated for 3 m, below the 2 m for 9 m.
     sigma = 3.0
     made = guidance(gap(2.0 * (RADIUS + k * sigma - 0.8)), k=k)
     _, guides = follow(made, sigma=sigma, measured=measured)
