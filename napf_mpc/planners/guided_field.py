@@ -28,6 +28,8 @@ PULL_PER_S = 0.5
 """An avoiding UAV, which does not track its lane, is drawn to the guide at this rate ..."""
 MOST_PULL_MPS = 1.0
 """... but no faster than this."""
+STRICT = GuidanceSettings(measured_k=0.0)
+"""Repulsion keeps no distance in a gap that lacks some: NAPF is led into none that its own k calls closed."""
 
 
 class GuidedNapfPlanner(PotentialFieldPlanner):
@@ -46,7 +48,7 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         Of the guidance.
     """
 
-    def __init__(self, problem: Problem, settings: GuidanceSettings | None = None) -> None:
+    def __init__(self, problem: Problem, settings: GuidanceSettings = STRICT) -> None:
         super().__init__(problem, Inflation.of_problem(problem), "napf_guided")
         self.guidance = Guidance(problem, self.inflation, settings)
         self.guide: Guide | None = None
