@@ -16,7 +16,7 @@ from napf_mpc.planners.guidance import Guidance
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_band import Band, solve_band
 from napf_mpc.planners.guide_settings import GuidanceSettings
-from napf_mpc.planners.guided_field import GuidedNapfPlanner
+from napf_mpc.planners.guided_field import STRICT, GuidedNapfPlanner
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
@@ -289,13 +289,21 @@ def test_a_gap_too_narrow_for_the_margin_is_refused_or_announced() -> None:
 
 
 @pytest.mark.parametrize(
-    ("k", "measured", "held"),
-    [(1.0, False, True), (1.0, True, False), (3.0, False, False), (3.0, True, False)],
+    ("settings", "k", "measured", "held"),
+    [
+        (SETTINGS, 1.0, False, True),
+        (SETTINGS, 1.0, True, False),
+        (SETTINGS, 3.0, False, False),
+        (SETTINGS, 3.0, True, False),
+        (STRICT, 1.0, True, True),
+    ],
 )
-def test_a_small_k_makes_raw_measurements_no_steadier(k: float, measured: bool, held: bool) -> None:
+def test_a_small_k_makes_raw_measurements_no_steadier_for_the_qp(
+    settings: GuidanceSettings, k: float, measured: bool, held: bool
+) -> None:
     # 0.8 m too narrow on both sides: above the 0.28 m tolerated for 3 m, below the 2 m for 9 m.
     sigma = 3.0
-    made = guidance(gap(2.0 * (RADIUS + k * sigma - 0.8)), k=k)
+    made = guidance(gap(2.0 * (RADIUS + k * sigma - 0.8)), settings, k)
     _, guides = follow(made, sigma=sigma, measured=measured)
     assert (Passage.HOLD in reasons(guides)) == held
 
@@ -454,6 +462,7 @@ def test_the_registry_makes_the_guided_planner() -> None:
     planner = make_planner("napf_guided", problem())
     assert isinstance(planner, GuidedNapfPlanner)
     assert planner.name == "napf_guided"
+    assert planner.guidance.settings == STRICT
 
 
 def test_guidance_needs_a_formation() -> None:
