@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation import kalman
+from napf_mpc.vehicle.plant import plain
 
 __all__ = ["CovarianceForecast", "ForecastModel", "variance_ahead"]
 
@@ -99,22 +100,22 @@ class CovarianceForecast:
         fix_sigma : array, shape (run, uav, N, 3), optional
             Sigmas of the fixes up to each of the times, instead of those of now, infinite for none [m].
         """
-        model = self.model
-        fixes = self.fixes if fix_sigma is None else np.ones_like(self.fixes)
-        ticks = np.rint(np.asarray(ahead_s) / model.period_s).astype(np.int64)
-        out = np.empty((*self.fixes.shape, len(ticks), 3))
+        model, noise = self.model, self.model.error_noise
+        out = np.empty((*self.fixes.shape, len(ahead_s), 3))
         variance_ahead(
             self.packed,
             self.sigma[:, :, None] if fix_sigma is None else fix_sigma,
-            fixes & with_fixes,
-            model.fixless_axis & with_fixes,
-            ticks,
+            self.fixes if fix_sigma is None else np.ones_like(self.fixes),
+            model.fixless_axis,
+            with_fixes,
+            plain(ahead_s),
+            model.period_s,
             model.drift,
             model.ticks_per_epoch - self.age,
             self.epochs_to_new,
             self.epochs_per_new,
             model.error_memory,
-            np.ascontiguousarray(np.broadcast_to(model.error_noise, self.sigma.shape)),
+            noise if noise.ndim == 3 else noise[None, None],
             model.position_noise,
             model.velocity_noise,
             out,
@@ -150,7 +151,9 @@ def variance_ahead(
     sigma: Array,
     fixes: Mask,
     fixless_axis: Mask,
-    ticks: NDArray[np.int64],
+    with_fixes: bool,
+    ahead_s: Array,
+    period_s: float,
     drift: Array,
     ticks_to_epoch: int,
     epochs_to_new: int,
@@ -161,23 +164,27 @@ def variance_ahead(
     velocity_noise: float,
     out: Array,
 ) -> None:
-    """Write the variance of the position of each axis at some ticks from now.
+    """Write the variance of the position of each axis at some times from now.
 
     Parameters
     ----------
     packed, sigma : array, shapes (run, uav, 3, 10) and (run, uav, N or 1, 3)
-        Covariances now, and sigma of a fix up to each tick, or up to all of them [m].
+        Covariances now, and sigma of a fix up to each time, or up to all of them [m].
     fixes : array of bool, shape (run, uav)
-        Whether fixes go on.
+        Whether there are fixes.
     fixless_axis : array of bool, shape (3,)
         Axes whose position is measured at every epoch, with a fix or without.
-    ticks : array of int, shape (N,)
-        From now, increasing.
+    with_fixes : bool
+        Whether either goes on.
+    ahead_s : array, shape (N,)
+        From now, increasing, taken to the nearest tick [s].
+    period_s : float
+        Length of a tick [s].
     drift : array, shape (ticks an epoch + 1, 10)
         From :func:`drifts`.
     ticks_to_epoch, epochs_to_new, epochs_per_new : int
         When measurements come.
-    error_memory, error_noise : array, shapes (3,) and (run, uav, 3)
+    error_memory, error_noise : array, shapes (3,) and (run or 1, uav or 1, 3)
         Of the fix's error from one epoch to the next.
     position_noise, velocity_noise : float
         Variances of the white noise in position [m^2] and velocity [m^2/s^2].
@@ -187,18 +194,19 @@ def variance_ahead(
     # Axis beside axis: each is a chain of sums that wait for each other, and three chains wait side by side.
     c, usable = np.empty((3, kalman.PACKED)), np.empty(3, dtype=np.bool_)
     period = drift.shape[0] - 1
+    last_run, last_uav = error_noise.shape[0] - 1, error_noise.shape[1] - 1
     for r in range(packed.shape[0]):
         for i in range(packed.shape[1]):
             for a in range(3):
                 for e in range(kalman.PACKED):
                     c[a, e] = packed[r, i, a, e]
             now, to_epoch, to_new = 0, ticks_to_epoch, epochs_to_new
-            for k in range(ticks.shape[0]):
-                at = min(k, sigma.shape[2] - 1)
+            for k in range(ahead_s.shape[0]):
+                then, at = int(np.rint(ahead_s[k] / period_s)), min(k, sigma.shape[2] - 1)
                 for a in range(3):
                     usable[a] = 0.0 < sigma[r, i, at, a] < np.inf
-                while now < ticks[k]:
-                    n = min(ticks[k] - now, to_epoch)
+                while now < then:
+                    n = min(then - now, to_epoch)
                     for a in range(3):
                         _drift(c, a, drift, n)
                     now += n
@@ -207,10 +215,10 @@ def variance_ahead(
                         continue
                     to_epoch = period
                     to_new -= 1
-                    fix = fixes[r, i] and to_new == 0
+                    fix = with_fixes and fixes[r, i] and to_new == 0
                     for a in range(3):
-                        _forget(c, a, error_memory[a], error_noise[r, i, a])
-                        if usable[a] and (fix or fixless_axis[a]):
+                        _forget(c, a, error_memory[a], error_noise[min(r, last_run), min(i, last_uav), a])
+                        if usable[a] and (fix or (with_fixes and fixless_axis[a])):
                             _measured(c, a, 1.0, 0.0, sigma[r, i, at, a], position_noise)
                         if usable[a] and fix:
                             _measured(c, a, 0.0, 1.0, 0.0, velocity_noise)
