@@ -219,9 +219,9 @@ def variance_ahead(
                     for a in range(3):
                         _forget(c, a, error_memory[a], error_noise[min(r, last_run), min(i, last_uav), a])
                         if usable[a] and (fix or (with_fixes and fixless_axis[a])):
-                            _measured(c, a, 1.0, 0.0, sigma[r, i, at, a], position_noise)
+                            _measured_place(c, a, sigma[r, i, at, a], position_noise)
                         if usable[a] and fix:
-                            _measured(c, a, 0.0, 1.0, 0.0, velocity_noise)
+                            _measured_speed(c, a, velocity_noise)
                     if to_new == 0:
                         to_new = epochs_per_new
                 for a in range(3):
@@ -258,17 +258,27 @@ def _forget(c: Array, a: int, memory: float, noise: float) -> None:
 
 
 @compiled_bare
-def _measured(c: Array, a: int, h_p: float, h_v: float, h_g: float, noise: float) -> None:
-    """Covariance after a measurement of ``h_p p + h_v v + h_g g``.
+def _measured_place(c: Array, a: int, sigma: float, noise: float) -> None:
+    """Covariance after a fix, which measures ``p + sigma g``."""
+    p, v = c[a, 0] + sigma * c[a, 2], c[a, 1] + sigma * c[a, 5]
+    g, b = c[a, 2] + sigma * c[a, 7], c[a, 3] + sigma * c[a, 8]
+    _lessen(c, a, p, v, g, b, p + sigma * g + noise)
+
+
+@compiled_bare
+def _measured_speed(c: Array, a: int, noise: float) -> None:
+    """Covariance after a measurement of ``v``."""
+    _lessen(c, a, c[a, 1], c[a, 4], c[a, 5], c[a, 6], c[a, 4] + noise)
+
+
+@compiled_bare
+def _lessen(c: Array, a: int, p: float, v: float, g: float, b: float, variance: float) -> None:
+    """Take off what a measurement of some variance tells by its covariances with p, v, g and b.
 
     Shorter than the filter's own update, which must stay sound for hours; over a horizon the plain difference
     does.
     """
-    p = h_p * c[a, 0] + h_v * c[a, 1] + h_g * c[a, 2]
-    v = h_p * c[a, 1] + h_v * c[a, 4] + h_g * c[a, 5]
-    g = h_p * c[a, 2] + h_v * c[a, 5] + h_g * c[a, 7]
-    b = h_p * c[a, 3] + h_v * c[a, 6] + h_g * c[a, 8]
-    scale = 1.0 / (h_p * p + h_v * v + h_g * g + noise)
+    scale = 1.0 / variance
     c[a, 0] -= scale * p * p
     c[a, 1] -= scale * p * v
     c[a, 2] -= scale * p * g
