@@ -26,7 +26,7 @@ from napf_mpc.constraints.clearance_rows import (
     influence_rows,
     shortfalls,
 )
-from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
+from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows, even_prices
 from napf_mpc.constraints.passage import margins_beside, passage_margins
 from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins, sigma_along
 from napf_mpc.jit import compiled
@@ -94,24 +94,19 @@ class Gaps:
         kept = (runs, uavs, stages, count)
         distance, *rest = np.empty((5, *kept))
         gaps, shift = cls(distance, np.empty((*kept, 3)), *rest), inflation.mode == "shift"
+        place = horizon.position.reshape(runs, uavs * stages, 3)
         if margin == "half_space" and inflation.reading in ("directional", "chi2"):
             world = horizon.obstacles
-            place = horizon.position.reshape(runs, uavs * stages, 3)
             _find_and_choose(
                 world.solids, world.tree, world.scene_start, plain(world.check_points("points", place)),
-                plain(horizon.covariance).reshape(-1, 3, 3), stages, reach_m + radius, radius, reach_m,
+                plain(horizon.covariance), reach_m + radius, radius, reach_m,
                 inflation.k * math.sqrt(3.0), inflation.k, shift, rho_0,
-                *gaps._flat(),
+                gaps.distance, gaps.normal, gaps.margin, gaps.sigma, gaps.shifted, gaps.influence,
             )  # fmt: skip
             return gaps
         reach = reach_m + radius + inflation.largest_margin(horizon.covariance)
         # An obstacle a little farther off may act more where the error is larger in its direction.
-        near = horizon.obstacles.near(
-            horizon.position.reshape(runs, uavs * stages, 3),
-            reach.reshape(runs, uavs * stages),
-            2 * count,
-            together=stages,
-        )
+        near = horizon.obstacles.near(place, reach.reshape(runs, uavs * stages), 2 * count, together=stages)
         shape, points = (runs, uavs, stages, 2 * count), runs * uavs * stages
         normal, index = near.gradient.reshape(*shape, 3), near.index.reshape(shape)
         sigma = _sigma(horizon.covariance, normal, inflation)
@@ -129,15 +124,14 @@ class Gaps:
             reach_m,
             shift,
             rho_0,
-            *gaps._flat(),
+            gaps.distance,
+            gaps.normal,
+            gaps.margin,
+            gaps.sigma,
+            gaps.shifted,
+            gaps.influence,
         )
         return gaps
-
-    def _flat(self) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """Distance, normal, margin, sigma, shifted and influence point by point: the same memory."""
-        m = self.distance.shape[-1]
-        flat = [part.reshape(-1, m) for part in (self.margin, self.sigma, self.shifted, self.influence)]
-        return self.distance.reshape(-1, m), self.normal.reshape(-1, m, 3), flat[0], flat[1], flat[2], flat[3]
 
 
 @compiled
@@ -172,10 +166,16 @@ def _choose(
         Whether the margin shifts the distance; otherwise it widens the range.
     rho_0 : float
         Range of influence [m].
+    out_distance ... out_influence : array, shapes (run, uav, N, few) and, of the normals, (..., few, 3)
+        Out.
     """
-    m, few = distance.shape[1], out_distance.shape[1]
+    points, m = distance.shape
+    few = out_distance.shape[3]
+    to_distance, to_normal = out_distance.reshape(points, few), out_normal.reshape(points, few, 3)
+    to_size, to_sigma = out_size.reshape(points, few), out_sigma.reshape(points, few)
+    to_shifted, to_influence = out_shifted.reshape(points, few), out_influence.reshape(points, few)
     rank, place = np.empty(m), np.empty(m, dtype=np.int64)
-    for p in range(distance.shape[0]):
+    for p in range(points):
         for j in range(m):
             by = distance[p, j] - radius - size[p, j]
             rank[j] = by if by < reach_m else np.inf
@@ -200,20 +200,19 @@ def _choose(
             i = place[j]
             none = rank[i] == np.inf
             gap = distance[p, i] - radius
-            out_size[p, j], out_sigma[p, j] = size[p, i], sigma[p, i]
-            out_distance[p, j] = np.inf if none else gap
-            out_shifted[p, j] = np.inf if none else gap - size[p, i] if shift else gap
-            out_influence[p, j] = rho_0 if shift else rho_0 + size[p, i]
+            to_size[p, j], to_sigma[p, j] = size[p, i], sigma[p, i]
+            to_distance[p, j] = np.inf if none else gap
+            to_shifted[p, j] = np.inf if none else gap - size[p, i] if shift else gap
+            to_influence[p, j] = rho_0 if shift else rho_0 + size[p, i]
             for axis in range(3):
-                out_normal[p, j, axis] = 0.0 if none else normal[p, i, axis]
+                to_normal[p, j, axis] = 0.0 if none else normal[p, i, axis]
 
 
 @compiled
 def _find_and_choose(
-    solids: Solids, tree: BoxTree, scene_start: Index, points: Array, covariance: Array, together: int,
-    least_m: float, radius: float, reach_m: float, sigmas: float, k: float, shift: bool, rho_0: float,
-    out_distance: Array, out_normal: Array, out_size: Array, out_sigma: Array, out_shifted: Array,
-    out_influence: Array,
+    solids: Solids, tree: BoxTree, scene_start: Index, points: Array, covariance: Array, least_m: float,
+    radius: float, reach_m: float, sigmas: float, k: float, shift: bool, rho_0: float, out_distance: Array,
+    out_normal: Array, out_size: Array, out_sigma: Array, out_shifted: Array, out_influence: Array,
 ) -> None:  # fmt: skip
     """Find twice as many obstacles as are kept, with margins of k sigma along their normals, and choose.
 
@@ -221,24 +220,22 @@ def _find_and_choose(
 
     Parameters
     ----------
-    points, covariance : array, shapes (run, point, 3) and (run x point, 3, 3)
+    points, covariance : array, shapes (run, uav x N, 3) and (run, uav, N, 3, 3)
         Where [m], and how certain [m^2].
-    together : int
-        Points in a row that belong to one plan.
     least_m, sigmas : float
         Obstacles are looked for within this distance and so many root mean square sigmas.
     """
-    runs, each, m = points.shape[0], points.shape[1], 2 * out_distance.shape[1]
+    runs, each, together, m = points.shape[0], points.shape[1], covariance.shape[2], 2 * out_distance.shape[3]
     total = runs * each
-    reach = np.empty((runs, each))
+    certain, reach = covariance.reshape(total, 3, 3), np.empty((runs, each))
     for p in range(total):
-        trace = covariance[p, 0, 0] + covariance[p, 1, 1] + covariance[p, 2, 2]
+        trace = certain[p, 0, 0] + certain[p, 1, 1] + certain[p, 2, 2]
         reach[p // each, p % each] = least_m + sigmas * math.sqrt(max(trace, 0.0) / 3.0)
     distance, normal = np.empty((runs, each, m)), np.empty((runs, each, m, 3))
     index = np.empty((runs, each, m), dtype=np.int64)
     near_all(solids, tree, scene_start, points, reach, together, distance, normal, index)
     flat, size, sigma = normal.reshape(total, m, 3), np.empty((total, m)), np.empty((total, m))
-    _directional(covariance, flat, sigma)
+    _directional(certain, flat, sigma)
     for p in range(total):
         for j in range(m):
             size[p, j] = k * sigma[p, j]
@@ -353,9 +350,9 @@ class _Shell:
                 'does not go with it, choose "directional" or "chi2"'
             )
         asked = (inflation, self.obstacles, max(self.reach_m, least_reach_m), self.margin)
-        if asked not in horizon.memo:
-            horizon.memo[asked] = Gaps.of(horizon, *asked)
-        gaps: Gaps = horizon.memo[asked]
+        gaps: Gaps | None = horizon.memo.get(asked)
+        if gaps is None:
+            gaps = horizon.memo[asked] = Gaps.of(horizon, *asked)
         return gaps
 
 
@@ -458,11 +455,8 @@ class ObstacleContact(_Shell):
             gaps.normal, gaps.shifted, gaps.sigma, plain(horizon.position), *self._extra(), opening,
             horizon.times_s, lower,
         )  # fmt: skip
-        slack = (*horizon.shape, 1)
-        return LinearRows(
-            "position", gaps.normal, lower, None, np.full(slack, self.w1), np.full(slack, self.w2),
-            shared_slack=True,
-        )  # fmt: skip
+        prices = even_prices((*horizon.shape, 1), self.w1, self.w2)
+        return LinearRows("position", gaps.normal, lower, None, *prices, shared_slack=True)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -71,11 +72,8 @@ class Horizon:
 
     @property
     def times_s(self) -> Array:
-        """(N,) time from now at the end of each stage [s]."""
-        if "times_s" not in self.memo:
-            self.memo["times_s"] = np.cumsum(self.step_s)
-        times: Array = self.memo["times_s"]
-        return times
+        """(N,) time from now at the end of each stage, kept: nobody may write into it [s]."""
+        return _ends(plain(self.step_s).tobytes())
 
     def check(self) -> None:
         """Refuse a horizon whose arrays do not fit each other or are not finite.
@@ -113,6 +111,20 @@ class Horizon:
             raise ConstraintError("horizon: " + "; ".join(faults))
 
 
+def even_prices(shape: tuple[int, ...], w1: float, w2: float) -> tuple[Array, Array]:
+    """Prices of slacks (run, uav, N, m), the same for all."""
+    linear, quadratic = np.empty(shape), np.empty(shape)
+    linear.fill(w1)
+    quadratic.fill(w2)
+    return linear, quadratic
+
+
+@lru_cache(maxsize=16)
+def _ends(step_s: bytes) -> Array:
+    """Ends (N,) of stages of some lengths, kept: nobody may write into them [s]."""
+    return np.cumsum(np.frombuffer(step_s))
+
+
 def along_rows(jac: Array, signal: Array) -> Array:
     """Return jac (run, uav, N, m, dim) . signal (run, uav, N or 1, dim), shape (run, uav, N, m)."""
     runs, uavs, stages, _, dim = jac.shape
@@ -138,9 +150,18 @@ def _along_rows(jac: Array, signal: Array, out: Array) -> None:
                     out[run, uav, k, j] = total
 
 
+def _shifted(jac: Array, origin: Array, bound: Array) -> Array:
+    """Bounds (run, uav, N, m) of rows for a signal measured from an origin (run, uav, dim)."""
+    if bound.shape != jac.shape[:-1]:
+        raise ConstraintError(f"a bound has shape {bound.shape}, and the rows {jac.shape}")
+    out = np.empty(bound.shape)
+    _shift(jac, origin, plain(bound), out)
+    return out
+
+
 @compiled_bare
 def _shift(jac: Array, origin: Array, bound: Array, moved: Array) -> None:
-    """Write bounds (run, uav, N, m) of rows for a signal measured from an origin (run, uav, dim)."""
+    """Write what :func:`_shifted` returns."""
     runs, uavs, stages, count, dim = jac.shape
     for run in range(runs):
         for uav in range(uavs):
@@ -219,17 +240,8 @@ class LinearRows:
         jac, place = plain(self.jac), plain(origin)
         if place.shape != (*jac.shape[:2], jac.shape[-1]):
             raise ConstraintError(f"origin has shape {place.shape}, and the rows {jac.shape}")
-
-        def moved(bound: Array | None) -> Array | None:
-            if bound is None:
-                return None
-            if bound.shape != jac.shape[:-1]:
-                raise ConstraintError(f"a bound has shape {bound.shape}, and the rows {jac.shape}")
-            out = np.empty(bound.shape)
-            _shift(jac, place, plain(bound), out)
-            return out
-
-        lower, upper = moved(self.lower), moved(self.upper)
+        lower = None if self.lower is None else _shifted(jac, place, self.lower)
+        upper = None if self.upper is None else _shifted(jac, place, self.upper)
         return LinearRows(self.signal, self.jac, lower, upper, self.w1, self.w2, self.shared_slack)
 
     def check(self, shape: tuple[int, int, int]) -> None:

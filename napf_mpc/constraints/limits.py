@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from napf_mpc.constraints.clearance import check_opening, opening_distance
-from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
+from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows, even_prices
 from napf_mpc.problem import FormationMission, Vehicle
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
@@ -40,8 +40,7 @@ PLACE_W1, PLACE_W2 = 1000.0, 100.0
 
 
 def _soft(horizon: Horizon, count: int, w1: float, w2: float) -> tuple[Array, Array]:
-    shape = (*horizon.shape, count)
-    return np.full(shape, w1), np.full(shape, w2)
+    return even_prices((*horizon.shape, count), w1, w2)
 
 
 def _everywhere(horizon: Horizon, values: Array) -> Array:

@@ -25,7 +25,7 @@ from napf_mpc.constraints.clearance import (
     extra_distance,
     opening_distance,
 )
-from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
+from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows, even_prices
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.world.moving import round_distance
@@ -85,18 +85,16 @@ class MovingObstacleContact:
             for axis in range(3):
                 along += normal[..., axis] * horizon.position[..., None, axis]
                 begun += normal[..., axis] * horizon.position[:, :, :1, None, axis]
-            here, times_s = shifted + (begun - along), np.cumsum(horizon.step_s)
+            here, times_s = shifted + (begun - along), horizon.times_s
             asked = opening_distance(np.zeros(shifted.shape), here, self.opening_mps, times_s)
             jac[..., :found, :] = normal
             lower[..., :found] = along + (asked - shifted)
-        slack = (*horizon.shape, 1)
-        return LinearRows(
-            "position", jac, lower, None, np.full(slack, self.w1), np.full(slack, self.w2), shared_slack=True
-        )
+        prices = even_prices((*horizon.shape, 1), self.w1, self.w2)
+        return LinearRows("position", jac, lower, None, *prices, shared_slack=True)
 
     def _nearest(self, horizon: Horizon, tracks: Tracks, inflation: Inflation) -> tuple[Array, Array]:
         """Normals (run, uav, N, m, 3) and shifted distances less the extra (run, uav, N, m), by index."""
-        centres, spread = tracks.predicted(np.cumsum(horizon.step_s))
+        centres, spread = tracks.predicted(horizon.times_s)
         centres, spread = centres.transpose(0, 2, 1, 3)[:, None], spread.transpose(0, 2, 1, 3, 4)[:, None]
         distance, normal = round_distance(
             horizon.position[:, :, :, None], centres, tracks.radius, tracks.upright

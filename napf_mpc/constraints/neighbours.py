@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
+from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows, even_prices
 from napf_mpc.constraints.probability import sigma_along
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.jit import compiled, compiled_bare
@@ -150,12 +150,12 @@ class NeighbourSeparation:
         runs, uavs, stages = horizon.shape
         inflation = self.inflation or Inflation.of_problem(horizon.problem)
         shape = (runs, uavs, stages, self.neighbours)
-        jac, lower = np.zeros((*shape, 3)), np.full(shape, -np.inf)
+        jac, lower = np.empty((*shape, 3)), np.empty(shape)
         along_normal = inflation.reading in ("directional", "chi2")
         _separate(
             plain(horizon.position),
             plain(horizon.covariance),
-            _cross(horizon.common_factor),
+            plain(horizon.common_factor),
             np.empty((0, 0, 0, 0)) if along_normal else self._even_margin(horizon, inflation),
             inflation.k,
             _distance(self.distance_m, horizon.problem),
@@ -168,7 +168,7 @@ class NeighbourSeparation:
             jac,
             lower,
         )
-        return LinearRows("position", jac, lower, None, np.full(shape, self.w1), np.full(shape, self.w2))
+        return LinearRows("position", jac, lower, None, *even_prices(shape, self.w1, self.w2))
 
     def _pairs(self, horizon: Horizon) -> tuple[Array, Array]:
         """Where to part, and most that is asked, of each pair; the same as long as problem and frame are."""
@@ -195,17 +195,9 @@ class NeighbourSeparation:
         return plain(np.broadcast_to(self.slot_part * np.sqrt(_dot(apart, apart)), pairs))
 
 
-def _cross(common_factor: Array) -> Array:
-    """Sigma_ij + Sigma_ij^T of all pairs, (run, uav, neighbour, 3, 3) [m^2]."""
-    runs, uavs = common_factor.shape[:2]
-    cross = np.empty((runs, uavs, uavs, 3, 3))
-    _shared(plain(common_factor), cross)
-    return cross
-
-
 @compiled
 def _shared(factor: Array, cross: Array) -> None:
-    """Write L_i L_j^T + L_j L_i^T of factors (run, uav, 3, rank)."""
+    """Write Sigma_ij + Sigma_ij^T = L_i L_j^T + L_j L_i^T of factors (run, uav, 3, rank) [m^2]."""
     one = np.empty((3, 3))
     for run in range(cross.shape[0]):
         for i in range(cross.shape[1]):
@@ -240,7 +232,7 @@ def _plane(
 def _separate(
     position: Array,
     covariance: Array,
-    cross: Array,
+    factor: Array,
     margin: Array,
     k: float,
     distance_m: float,
@@ -260,8 +252,8 @@ def _separate(
     ----------
     position, covariance : array, shapes (run, uav, N, 3) and (run, uav, N, 3, 3)
         As planned, and their errors.
-    cross : array, shape (run, uav, uav, 3, 3)
-        What errors of pairs have in common, both ways round.
+    factor : array, shape (run, uav, 3, rank)
+        Of what errors have in common.
     margin : array, shape (run, N, uav, uav), or without entries
         Margins [m]; without, k sigma along the normal.
     aside : array, shape (uav, uav, 3)
@@ -271,9 +263,12 @@ def _separate(
     times_s : array, shape (N,)
         Ends of the stages [s].
     jac, lower : array, shapes (run, uav, N, m, 3) and (run, uav, N, m)
-        Rows; switched off as they come.
+        Rows, out.
     """
     runs, uavs, stages = position.shape[:3]
+    jac[:], lower[:] = 0.0, -np.inf  # switched off
+    cross = np.empty((runs, uavs, uavs, 3, 3))
+    _shared(factor, cross)
     few = min(lower.shape[3], uavs)
     normal, spare = np.empty((uavs, uavs, 3)), np.full((uavs, uavs), np.inf)
     relative, nearest = np.empty((3, 3)), np.empty(uavs, dtype=np.int64)
@@ -384,7 +379,7 @@ def margin_attainable(
     factor = common_factor.reshape(len(kept), *common_factor.shape[-3:])
     _keep(
         plain(covariance.reshape(len(kept), uavs, 3, 3)),
-        _cross(factor),
+        plain(factor),
         inflation.k,
         normal,
         room,
@@ -396,10 +391,11 @@ def margin_attainable(
 
 @compiled
 def _keep(
-    covariance: Array, cross: Array, k: float, normal: Array, room: Array, reach: Array, kept: Mask
+    covariance: Array, factor: Array, k: float, normal: Array, room: Array, reach: Array, kept: Mask
 ) -> None:
     """Write whether pairs have room (uav, uav) for their reach and k sigma along their normals."""
-    relative = np.empty((3, 3))
+    cross, relative = np.empty((*kept.shape, 3, 3)), np.empty((3, 3))
+    _shared(factor, cross)
     for run in range(kept.shape[0]):
         for i in range(kept.shape[1]):
             for j in range(kept.shape[1]):
@@ -444,38 +440,45 @@ class ShortMargins:
 
         Parameters
         ----------
-        covariance, common_factor : array, shapes (run, uav, 3, 3) and (run, uav, 3, rank)
-            As reported [m^2], [m]; of a UAV that is not trusted they count as zero.
+        covariance, common_factor : array, shapes (run, uav, n, n) and (run, uav, 3, rank)
+            As reported, the position first [m^2], [m]; of a UAV that is not trusted they count as zero.
         trusted : array of bool, shape (run, uav)
             Whose navigation is trusted.
         counts : array of int, shape (run,)
             Added to.
         """
-        if not trusted.all():
-            known = trusted[..., None, None]
-            covariance = np.where(known, covariance, 0.0)
-            common_factor = np.where(known, common_factor, 0.0)
         inflation = self._inflation
         if inflation.reading in ("directional", "chi2"):
-            cross, planes = _cross(common_factor), self._planes
-            _count_short(plain(covariance), cross, inflation.k, *planes, trusted, counts)
-        else:
-            kept = margin_attainable(self._problem, covariance, common_factor, inflation=inflation)
-            counts += (trusted & ~kept.all(-1)).sum(-1)
+            covariance, factor = plain(covariance), plain(common_factor)
+            _count_short(covariance, factor, inflation.k, *self._planes, trusted, counts)
+            return
+        known = trusted[..., None, None]
+        covariance = np.where(known, covariance[..., :3, :3], 0.0)
+        common_factor = np.where(known, common_factor, 0.0)
+        kept = margin_attainable(self._problem, covariance, common_factor, inflation=inflation)
+        counts += (trusted & ~kept.all(-1)).sum(-1)
 
 
 @compiled
 def _count_short(
-    covariance: Array, cross: Array, k: float, normal: Array, room: Array, reach: Array, trusted: Mask,
+    covariance: Array, factor: Array, k: float, normal: Array, room: Array, reach: Array, trusted: Mask,
     counts: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Count trusted UAVs with a pair that :func:`_keeps` says has no room."""
-    relative = np.empty((3, 3))
-    for run in range(trusted.shape[0]):
-        for i in range(trusted.shape[1]):
+    runs, uavs = trusted.shape
+    known, shared = np.zeros((runs, uavs, 3, 3)), np.zeros(factor.shape)
+    cross, relative = np.empty((runs, uavs, uavs, 3, 3)), np.empty((3, 3))
+    for run in range(runs):
+        for i in range(uavs):
+            if trusted[run, i]:
+                known[run, i] = covariance[run, i, :3, :3]
+                shared[run, i] = factor[run, i]
+    _shared(shared, cross)
+    for run in range(runs):
+        for i in range(uavs):
             short = 0
-            for j in range(trusted.shape[1]):
-                short += not _keeps(covariance, cross, run, i, j, k, normal, room, reach, relative)
+            for j in range(uavs):
+                short += not _keeps(known, cross, run, i, j, k, normal, room, reach, relative)
             counts[run] += short > 0 and trusted[run, i]
 
 

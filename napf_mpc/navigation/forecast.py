@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation import kalman
+from napf_mpc.vehicle.plant import plain
 
 __all__ = ["CovarianceForecast", "ForecastModel", "variance_ahead"]
 
@@ -24,8 +25,6 @@ Mask = NDArray[np.bool_]
 
 LANES = 16
 """Axes of UAVs carried side by side: each is a chain of sums that wait for each other."""
-POSITION, VELOCITY = 0, 1
-"""What a fix measures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,22 +103,22 @@ class CovarianceForecast:
         fix_sigma : array, shape (run, uav, N, 3), optional
             Sigmas of the fixes up to each of the times, instead of those of now, infinite for none [m].
         """
-        model = self.model
-        fixes = self.fixes if fix_sigma is None else np.ones_like(self.fixes)
-        ticks = np.rint(np.asarray(ahead_s) / model.period_s).astype(np.int64)
-        out = np.empty((*self.fixes.shape, len(ticks), 3))
+        model, noise = self.model, self.model.error_noise
+        out = np.empty((*self.fixes.shape, len(ahead_s), 3))
         variance_ahead(
             self.packed,
             self.sigma[:, :, None] if fix_sigma is None else fix_sigma,
-            fixes & with_fixes,
-            model.fixless_axis & with_fixes,
-            ticks,
+            self.fixes if fix_sigma is None else np.ones_like(self.fixes),
+            model.fixless_axis,
+            with_fixes,
+            plain(ahead_s),
+            model.period_s,
             model.drift,
             model.ticks_per_epoch - self.age,
             self.epochs_to_new,
             self.epochs_per_new,
             model.error_memory,
-            np.ascontiguousarray(np.broadcast_to(model.error_noise, self.sigma.shape)),
+            noise if noise.ndim == 3 else noise[None, None],
             model.position_noise,
             model.velocity_noise,
             out,
@@ -155,7 +154,9 @@ def variance_ahead(
     sigma: Array,
     fixes: Mask,
     fixless_axis: Mask,
-    ticks: NDArray[np.int64],
+    with_fixes: bool,
+    ahead_s: Array,
+    period_s: float,
     drift: Array,
     ticks_to_epoch: int,
     epochs_to_new: int,
@@ -166,35 +167,40 @@ def variance_ahead(
     velocity_noise: float,
     out: Array,
 ) -> None:
-    """Write the variance of the position of each axis at some ticks from now.
+    """Write the variance of the position of each axis at some times from now.
 
     Parameters
     ----------
     packed, sigma : array, shapes (run, uav, 3, 10) and (run, uav, N or 1, 3)
-        Covariances now, and sigma of a fix up to each tick, or up to all of them [m].
+        Covariances now, and sigma of a fix up to each time, or up to all of them [m].
     fixes : array of bool, shape (run, uav)
-        Whether fixes go on.
+        Whether there are fixes.
     fixless_axis : array of bool, shape (3,)
         Axes whose position is measured at every epoch, with a fix or without.
-    ticks : array of int, shape (N,)
-        From now, increasing.
+    with_fixes : bool
+        Whether either goes on.
+    ahead_s : array, shape (N,)
+        From now, increasing, taken to the nearest tick [s].
+    period_s : float
+        Length of a tick [s].
     drift : array, shape (ticks an epoch + 1, 10)
         From :func:`drifts`.
     ticks_to_epoch, epochs_to_new, epochs_per_new : int
         When measurements come.
-    error_memory, error_noise : array, shapes (3,) and (run, uav, 3)
+    error_memory, error_noise : array, shapes (3,) and (run or 1, uav or 1, 3)
         Of the fix's error from one epoch to the next.
     position_noise, velocity_noise : float
         Variances of the white noise in position [m^2] and velocity [m^2/s^2].
     out : array, shape (run, uav, N, 3)
         Out [m^2].
     """
-    c, error = np.empty((kalman.PACKED, LANES)), np.empty((2, LANES))
+    c, sigma_at = np.empty((kalman.PACKED, LANES)), np.empty(LANES)
     memory, noise = np.empty(LANES), np.empty(LANES)
-    place, used = np.empty((3, LANES), dtype=np.uint32), np.empty((2, LANES), dtype=np.bool_)
+    place = np.empty((3, LANES), dtype=np.uint32)
+    by_place, by_speed = np.empty(LANES, dtype=np.bool_), np.empty(LANES, dtype=np.bool_)
     uavs, period = packed.shape[1], drift.shape[0] - 1
     axes = packed.shape[0] * uavs * 3
-    error[VELOCITY] = 0.0
+    last_run, last_uav = error_noise.shape[0] - 1, error_noise.shape[1] - 1
     for first in range(0, axes, LANES):
         last = min(first + LANES, axes)
         for lane in range(LANES):
@@ -204,11 +210,12 @@ def variance_ahead(
             place[0, lane], place[1, lane], place[2, lane] = r, i, a
             for e in range(kalman.PACKED):
                 c[e, lane] = packed[r, i, a, e]
-            memory[lane], noise[lane] = error_memory[a], error_noise[r, i, a]
+            memory[lane], noise[lane] = error_memory[a], error_noise[min(r, last_run), min(i, last_uav), a]
         now, to_epoch, to_new = 0, ticks_to_epoch, epochs_to_new
-        for k in range(ticks.shape[0]):
-            while now < ticks[k]:
-                n = min(ticks[k] - now, to_epoch)
+        for k in range(ahead_s.shape[0]):
+            then = int(np.rint(ahead_s[k] / period_s))
+            while now < then:
+                n = min(then - now, to_epoch)
                 _drift(c, drift, n)
                 now += n
                 to_epoch -= n
@@ -216,19 +223,17 @@ def variance_ahead(
                     continue
                 to_epoch = period
                 to_new -= 1
-                measured = 0
-                for lane in range(LANES):
-                    r, i, a = place[0, lane], place[1, lane], place[2, lane]
-                    size = sigma[r, i, min(k, sigma.shape[2] - 1), a]
-                    usable, fix = 0.0 < size < np.inf, fixes[r, i] and to_new == 0
-                    error[POSITION, lane] = size
-                    used[POSITION, lane] = usable and (fix or fixless_axis[a])
-                    used[VELOCITY, lane] = usable and fix
-                    measured += used[POSITION, lane]
                 _forget(c, memory, noise)
-                if measured > 0:
-                    _measured(c, 1.0, 0.0, error, POSITION, position_noise, used)
-                    _measured(c, 0.0, 1.0, error, VELOCITY, velocity_noise, used)
+                if with_fixes:
+                    for lane in range(LANES):
+                        r, i, a = place[0, lane], place[1, lane], place[2, lane]
+                        size = sigma[r, i, min(k, sigma.shape[2] - 1), a]
+                        usable, fix = 0.0 < size < np.inf, fixes[r, i] and to_new == 0
+                        sigma_at[lane] = size
+                        by_place[lane] = usable and (fix or fixless_axis[a])
+                        by_speed[lane] = usable and fix
+                    _measured_place(c, sigma_at, position_noise, by_place)
+                    _measured_speed(c, velocity_noise, by_speed)
                 if to_new == 0:
                     to_new = epochs_per_new
             for lane in range(last - first):
@@ -270,28 +275,41 @@ def _forget(c: Array, memory: Array, noise: Array) -> None:
 
 
 @compiled_bare
-def _measured(c: Array, h_p: float, h_v: float, error: Array, which: int, noise: float, used: Mask) -> None:
-    """Covariance after a measurement of ``h_p p + h_v v + h_g g``, in the lanes that use it.
+def _measured_place(c: Array, sigma: Array, noise: float, used: Mask) -> None:
+    """Covariance after a fix, which measures ``p + sigma g``, in the lanes that use it."""
+    for lane in range(LANES):
+        size = sigma[lane]
+        p, v = c[0, lane] + size * c[2, lane], c[1, lane] + size * c[5, lane]
+        g, b = c[2, lane] + size * c[7, lane], c[3, lane] + size * c[8, lane]
+        _lessen(c, lane, used[lane], p, v, g, b, p + size * g + noise)
+
+
+@compiled_bare
+def _measured_speed(c: Array, noise: float, used: Mask) -> None:
+    """Covariance after a measurement of ``v``, in the lanes that use it."""
+    for lane in range(LANES):
+        p, v, g, b = c[1, lane], c[4, lane], c[5, lane], c[6, lane]
+        _lessen(c, lane, used[lane], p, v, g, b, v + noise)
+
+
+@compiled_bare
+def _lessen(c: Array, lane: int, used: bool, p: float, v: float, g: float, b: float, variance: float) -> None:
+    """Take off what a measurement of some variance tells by its covariances with p, v, g and b.
 
     Shorter than the filter's own update, which must stay sound for hours; over a horizon the plain difference
     does.
     """
-    for lane in range(LANES):
-        h_g, use = error[which, lane], used[which, lane]
-        pp, pv, pg, pb, vv = c[0, lane], c[1, lane], c[2, lane], c[3, lane], c[4, lane]
-        vg, vb, gg, gb, bb = c[5, lane], c[6, lane], c[7, lane], c[8, lane], c[9, lane]
-        p = h_p * pp + h_v * pv + h_g * pg
-        v = h_p * pv + h_v * vv + h_g * vg
-        g = h_p * pg + h_v * vg + h_g * gg
-        b = h_p * pb + h_v * vb + h_g * gb
-        scale = 1.0 / (h_p * p + h_v * v + h_g * g + noise)
-        c[0, lane] = pp - scale * p * p if use else pp
-        c[1, lane] = pv - scale * p * v if use else pv
-        c[2, lane] = pg - scale * p * g if use else pg
-        c[3, lane] = pb - scale * p * b if use else pb
-        c[4, lane] = vv - scale * v * v if use else vv
-        c[5, lane] = vg - scale * v * g if use else vg
-        c[6, lane] = vb - scale * v * b if use else vb
-        c[7, lane] = gg - scale * g * g if use else gg
-        c[8, lane] = gb - scale * g * b if use else gb
-        c[9, lane] = bb - scale * b * b if use else bb
+    scale = 1.0 / variance
+    pp, pv, pg, pb, vv = c[0, lane], c[1, lane], c[2, lane], c[3, lane], c[4, lane]
+    vg, vb, gg, gb, bb = c[5, lane], c[6, lane], c[7, lane], c[8, lane], c[9, lane]
+    # A choice of what is written, not whether: lanes go side by side.
+    c[0, lane] = pp - scale * p * p if used else pp
+    c[1, lane] = pv - scale * p * v if used else pv
+    c[2, lane] = pg - scale * p * g if used else pg
+    c[3, lane] = pb - scale * p * b if used else pb
+    c[4, lane] = vv - scale * v * v if used else vv
+    c[5, lane] = vg - scale * v * g if used else vg
+    c[6, lane] = vb - scale * v * b if used else vb
+    c[7, lane] = gg - scale * g * g if used else gg
+    c[8, lane] = gb - scale * g * b if used else gb
+    c[9, lane] = bb - scale * b * b if used else bb

@@ -153,10 +153,10 @@ class NavSolution:
         """
         trusted = np.empty(self.available.shape, dtype=np.bool_)
         _sound(
-            plain(self.position), plain(self.velocity), plain(self.attitude), plain(self.body_rates),
-            plain(self.covariance), trusted,
+            self.available, plain(self.position), plain(self.velocity), plain(self.attitude),
+            plain(self.body_rates), plain(self.covariance), trusted,
         )  # fmt: skip
-        return np.asarray(self.available & trusted)
+        return trusted
 
 
 def _carried_on(now: Array, then: Array, ahead_s: Array) -> tuple[Array, Array]:
@@ -189,12 +189,13 @@ def _stretch(covariance: Array, change: Array, out: Array) -> None:
 
 @compiled
 def _sound(
-    position: Array, velocity: Array, attitude: Array, rates: Array, covariance: Array, sound: Mask
-) -> None:
-    """Write whether all numbers of a solution are finite and its position's covariance is one."""
+    available: Mask, position: Array, velocity: Array, attitude: Array, rates: Array, covariance: Array,
+    sound: Mask,
+) -> None:  # fmt: skip
+    """Write whether a solution is there, all its numbers are finite, and its position's covariance is one."""
     for run in range(sound.shape[0]):
         for uav in range(sound.shape[1]):
-            fine = _semidefinite(covariance[run, uav])
+            fine = available[run, uav] and _semidefinite(covariance[run, uav])
             for a in range(3):
                 fine = fine and np.isfinite(position[run, uav, a]) and np.isfinite(velocity[run, uav, a])
                 fine = fine and np.isfinite(attitude[run, uav, a]) and np.isfinite(rates[run, uav, a])

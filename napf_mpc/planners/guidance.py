@@ -23,15 +23,17 @@ from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import SolidBoxes, frame_of, solid_boxes
-from napf_mpc.planners.guide_search import plan_all, resample_all
+from napf_mpc.planners.guide_search import plan_all, resample_all, resample_taut
 from napf_mpc.planners.guide_settings import FINE, GuidanceSettings, search_of
 from napf_mpc.planners.guide_sky import NO_SKY, SkyField, sky_field
 from napf_mpc.planners.guide_traffic import TrafficPace, slowed
+from napf_mpc.planners.passes import everybody
 from napf_mpc.planners.room import room_outwards
 from napf_mpc.planners.sigma_memory import SigmaMemory
 from napf_mpc.planners.taut import Clearance, pulled_taut
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.safety_distance import Inflation, rms_sigma
+from napf_mpc.vehicle.plant import plain
 from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
@@ -56,8 +58,8 @@ def guidance_covariance(nav: NavSolution, trusted: NDArray[np.bool_], ahead: Arr
     room = nav.position_covariance
     if ahead is not None:
         fixes = nav.available if nav.forecast is None else nav.forecast.fixes
-        room = ahead if fixes.all() else np.where(fixes[..., None, None], ahead, room)
-    return room if trusted.all() else np.where(trusted[..., None, None], room, np.eye(3))
+        room = ahead if everybody(fixes) else np.where(fixes[..., None, None], ahead, room)
+    return room if everybody(trusted) else np.where(trusted[..., None, None], room, np.eye(3))
 
 
 class Guidance:
@@ -90,6 +92,7 @@ class Guidance:
         self._frame = frame_of(self._path)
         self._slots = formation_offsets(problem.formation)
         self._lanes = np.ascontiguousarray(self._slots[:, 1:])
+        self._slots_along = np.ascontiguousarray(self._slots[:, 0])
         self._room_m = problem.planner.room_m
         self._min_separation = problem.vehicle.min_separation_m
         self._traffic = TrafficPace(
@@ -108,6 +111,7 @@ class Guidance:
         self._blind = search_of(self.settings, margins, problem.vehicle.radius_m)
         stations = (self._search.lattice.stations - 1) * FINE + 1
         self._step_m = self._search.lattice.step_m / FINE
+        self._bends = max(2, round(self.settings.bend_m / self._step_m) + 1)
         self.ahead_m: Array = self._step_m * np.arange(stations, dtype=np.float64)
         gap = self._slots[:, None] - self._slots[None]
         self._slot_distance = np.sqrt(gap[..., 0] ** 2 + gap[..., 1] ** 2 + gap[..., 2] ** 2)
@@ -121,7 +125,7 @@ class Guidance:
         self._obstacles = obstacles
         self._boxes: SolidBoxes = solid_boxes(obstacles, self._path)
         self._profiles = np.zeros((runs, uavs, stations, 2))
-        self._taut: Array | None = None
+        self._taut: tuple[Array, Array, Array] | None = None
         self._missing = np.zeros((runs, uavs, stations))
         self._kept = np.zeros((runs, uavs, stations))
         self._paid = np.zeros((runs, uavs + 1, 2))
@@ -183,10 +187,11 @@ class Guidance:
         Guide
             Offsets from where each UAV is now.
         """
-        np.copyto(self._position, position, where=trusted[..., None])
-        np.copyto(self._covariance, covariance, where=trusted[..., None, None])
-        place = self._path.to_path(self._position)
-        along = np.ascontiguousarray(place[..., 0])
+        place, (along, sigma) = np.empty(position.shape), np.empty((2, *trusted.shape))
+        _note(
+            plain(position), plain(covariance), trusted, self._path.origin, self._path.axes, self._position,
+            self._covariance, place, along, sigma,
+        )  # fmt: skip
         due = time_s >= self._next_s - 1e-9
         if due:
             self._look_up(sigma_map)
@@ -195,7 +200,7 @@ class Guidance:
             self._plan(place, elapsed, taut, measured, asked)
             self._last_s = time_s
             self._next_s = time_s + self.settings.period_s
-        guide = self._guide(along)
+        guide = self._guide(along, sigma)
         if tracks is None or not tracks.count:
             return guide
         if due:
@@ -204,10 +209,10 @@ class Guidance:
             )
         return slowed(guide, self._traffic_pace)
 
-    def _from(self, profiles: Array, along: Array) -> Array:
-        """Profiles (run, uav, station, channel) as seen from along-track places (run, uav)."""
-        out = np.empty_like(profiles)
-        resample_all(profiles, along - self._planned_at, self._step_m, out)
+    def _from(self, along: Array) -> Array:
+        """Profiles (run, uav, station, 2) as seen from along-track places (run, uav)."""
+        out = np.empty(self._profiles.shape)
+        resample_all(self._profiles, along - self._planned_at, self._step_m, out)
         return out
 
     def _look_up(self, sigma_map: SigmaMap | None) -> None:
@@ -228,7 +233,7 @@ class Guidance:
         # Stations stand still in the world: a gap must not open and close with where the samples fall.
         step = self.settings.step_m
         along = np.floor(place[..., 0] / step) * step
-        last = self._from(self._profiles, along)
+        last = self._from(along)
         offset = np.ascontiguousarray(place[..., 1:]) - self._lanes
         margin = np.ascontiguousarray(self._inflation.margin_covariance(self._covariance))
         if measured:
@@ -265,7 +270,7 @@ class Guidance:
             room = np.zeros(loose.shape)
             if self._room_m > 0.0:
                 room = room_outwards(*there, self._room_m)
-            self._taut = np.concatenate([pulled, loose[..., None], room[..., None]], axis=-1)
+            self._taut = pulled, loose, room
         self._hold(offset, elapsed_s, measured)
 
     def _separation(self, covariance: Array) -> Array:
@@ -277,50 +282,35 @@ class Guidance:
     def _hold(self, offset: Array, elapsed_s: float, measured: bool) -> None:
         """Decide per run how fast to go on, from what is blocked ahead and how near it is."""
         settings = self.settings
-        breach = np.maximum(self._missing - settings.spare_m, 0.0)
-        # Where a UAV is already inside the margin, a way that gets no worse leads out.
-        here = np.maximum(breach[..., 0], breach[..., 1])
-        worse = breach - here[..., None]
+        distance, squeezed, aside, slope, sigma = np.empty((5, len(offset)))
+        _largest_sigma(self._covariance, sigma)
         k = max(self._inflation.k, settings.measured_k) if measured else self._inflation.k
-        margin = k * rms_sigma(self._covariance).max(-1)
+        margin = k * sigma
         scale = np.maximum(1.0, margin / settings.usual_margin_m) ** settings.tolerance_power
-        distance = self._blocked_at(worse, settings.tolerance_m * scale)
+        few, many = settings.tolerance_m * scale, max(settings.tolerance_m, settings.squeeze_m) * scale
+        _measure(
+            self._missing, self._profiles, offset, self.ahead_m, settings.spare_m, few, many, self._bends,
+            self._step_m, distance, squeezed, aside, slope,
+        )  # fmt: skip
         self._squeezing &= distance <= settings.stop_m + settings.slow_m
         self._squeezing |= self._held_s >= settings.squeeze_after_s
-        distance = np.where(
-            self._squeezing,
-            self._blocked_at(worse, max(settings.tolerance_m, settings.squeeze_m) * scale),
-            distance,
-        )
+        distance = np.where(self._squeezing, squeezed, distance)
         release = np.where(self._holding, settings.release_m, 0.0)
-        astray = np.abs(self._profiles[:, :, 0] - offset).max((-1, -2)) > settings.aside_m
-        self._holding = (distance <= settings.stop_m + release) | (self._stuck & astray)
+        self._holding = (distance <= settings.stop_m + release) | (self._stuck & (aside > settings.aside_m))
         self._pace = np.clip((distance - settings.stop_m) / settings.slow_m, 0.2, 1.0)
-        self._pace = np.minimum(self._pace, self._slope_pace())
+        # The steepest piece just ahead has to be flown.
+        flown = np.clip(settings.flown_slope / np.maximum(slope, 1e-9), 0.3, 1.0)
+        self._pace = np.minimum(self._pace, flown)
         self._held_s = np.where(
             self._holding, self._held_s + elapsed_s, np.maximum(0.0, self._held_s - elapsed_s)
         )
         self._stuck = self._holding & (self._stuck | (self._held_s >= settings.aside_after_s))
         self._given_up |= self._held_s >= settings.hold_limit_s
 
-    def _slope_pace(self) -> Array:
-        """Factor (run,) on the speed at which the steepest piece just ahead can be flown."""
-        stations = max(2, round(self.settings.bend_m / self._step_m) + 1)
-        step = np.diff(self._profiles[:, :, :stations], axis=2) / self._step_m
-        slope = np.sqrt(step[..., 0] ** 2 + step[..., 1] ** 2).max((-1, -2))
-        return np.asarray(np.clip(self.settings.flown_slope / np.maximum(slope, 1e-9), 0.3, 1.0))
-
-    def _blocked_at(self, breach: Array, tolerance_m: Array) -> Array:
-        """Distance ahead (run,) at which the first breach (run, uav, station) exceeds a tolerance (run,)."""
-        blocked = breach > tolerance_m[:, None, None]
-        return np.asarray(np.where(blocked, self.ahead_m, np.inf).min((-1, -2)))
-
-    def _guide(self, along: Array) -> Guide:
-        settings, offset = self.settings, self._from(self._profiles, along)
-        sigma = np.empty(along.shape)
-        _sigma_along(self._covariance, self._path.along, sigma)
-        error = synchronisation_error(along, self._slots[:, 0])
-        pace, breach = np.empty(along.shape), np.empty(along.shape)
+    def _guide(self, along: Array, sigma: Array) -> Guide:
+        settings, offset = self.settings, self._from(along)
+        error = synchronisation_error(along, self._slots_along)
+        pace, breach = np.empty((2, *along.shape))
         reason = np.empty(along.shape, dtype=np.int8)
         _ask(
             offset, error, sigma, self._missing, settings.left_behind_m, settings.spare_m, self._pace,
@@ -328,8 +318,9 @@ class Guidance:
         )  # fmt: skip
         if self._taut is None:
             return Guide(self.ahead_m, offset, pace, reason, breach)
-        taut = self._from(self._taut, along)
-        return Guide(self.ahead_m, offset, pace, reason, breach, taut[..., :2], taut[..., 2], taut[..., 3])
+        taut, (loose, room) = np.empty(offset.shape), np.empty((2, *offset.shape[:3]))
+        resample_taut(*self._taut, along - self._planned_at, self._step_m, taut, loose, room)
+        return Guide(self.ahead_m, offset, pace, reason, breach, taut, loose, room)
 
 
 # Codes as plain numbers, for the compiled loop.
@@ -337,15 +328,100 @@ _NONE, _DETOUR, _WAIT, _SQUEEZE, _HOLD, _NO_PASSAGE = map(int, Passage)
 
 
 @compiled_bare
-def _sigma_along(covariance: Array, along: Array, sigma: Array) -> None:
-    """Write standard deviations (run, uav) along a direction, of covariances (run, uav, 3, 3)."""
-    for run in range(sigma.shape[0]):
-        for uav in range(sigma.shape[1]):
-            variance = 0.0
+def _note(
+    position: Array, covariance: Array, trusted: Mask, origin: Array, axes: Array, known_position: Array,
+    known_covariance: Array, place: Array, along: Array, sigma: Array,
+) -> None:  # fmt: skip
+    """Write what is trusted over what was known, and where that is on the path.
+
+    Parameters
+    ----------
+    position, covariance : array, shapes (run, uav, 3) and (run, uav, 3, 3)
+        As reported [m], [m^2].
+    trusted : array of bool, shape (run, uav)
+        Where it may be used.
+    origin, axes : array, shapes (3,) and (3, 3)
+        Of the path; rows along, left, up.
+    known_position, known_covariance : array, shapes (run, uav, 3) and (run, uav, 3, 3)
+        Written over.
+    place, along, sigma : array, shapes (run, uav, 3), (run, uav) and (run, uav)
+        Out: on the path, the first of it, and the standard deviation along the path [m].
+    """
+    for run in range(along.shape[0]):
+        for uav in range(along.shape[1]):
+            p, c, variance = known_position[run, uav], known_covariance[run, uav], 0.0
+            if trusted[run, uav]:
+                for a in range(3):
+                    p[a] = position[run, uav, a]
+                    for b in range(3):
+                        c[a, b] = covariance[run, uav, a, b]
+            x, y, z = p[0] - origin[0], p[1] - origin[1], p[2] - origin[2]
             for a in range(3):
+                place[run, uav, a] = x * axes[a, 0] + y * axes[a, 1] + z * axes[a, 2]
                 for b in range(3):
-                    variance += covariance[run, uav, a, b] * along[a] * along[b]
-            sigma[run, uav] = math.sqrt(max(variance, 0.0))
+                    variance += c[a, b] * axes[0, a] * axes[0, b]
+            along[run, uav], sigma[run, uav] = place[run, uav, 0], math.sqrt(max(variance, 0.0))
+
+
+@compiled_bare
+def _largest_sigma(covariance: Array, sigma: Array) -> None:
+    """Write the largest :func:`~napf_mpc.safety_distance.rms_sigma` of each run (run,) [m]."""
+    for run in range(sigma.shape[0]):
+        sigma[run] = 0.0
+        for uav in range(covariance.shape[1]):
+            c = covariance[run, uav]
+            rms = math.sqrt(max(c[0, 0] + c[1, 1] + c[2, 2], 0.0) / 3.0)
+            sigma[run] = max(sigma[run], rms)
+
+
+@compiled_bare
+def _measure(
+    missing: Array, profiles: Array, offset: Array, ahead_m: Array, spare_m: float, few_m: Array,
+    many_m: Array, bends: int, step_m: float, distance: Array, squeezed: Array, aside: Array, slope: Array,
+) -> None:  # fmt: skip
+    """Write what there is to decide from, of the ways ahead of each run.
+
+    Parameters
+    ----------
+    missing, profiles : array, shapes (run, uav, station) and (run, uav, station, 2)
+        Of the last plan [m].
+    offset : array, shape (run, uav, 2)
+        Of the UAVs now [m].
+    ahead_m : array, shape (station,)
+        [m].
+    spare_m : float
+        What may be missing [m].
+    few_m, many_m : array, shape (run,)
+        What is tolerated of a breach, and in a squeeze [m].
+    bends : int
+        Stations just ahead.
+    step_m : float
+        From station to station [m].
+    distance, squeezed : array, shape (run,)
+        Out: to the first breach that is not tolerated, endless for none [m].
+    aside : array, shape (run,)
+        Out: most that a UAV is off its profile, left or up [m].
+    slope : array, shape (run,)
+        Out: of the steepest piece just ahead.
+    """
+    for run in range(distance.shape[0]):
+        distance[run] = squeezed[run] = np.inf
+        aside[run] = slope[run] = 0.0
+        for uav in range(missing.shape[1]):
+            way = profiles[run, uav]
+            # Where a UAV is already inside the margin, a way that gets no worse leads out.
+            here = max(missing[run, uav, 0] - spare_m, missing[run, uav, 1] - spare_m, 0.0)
+            for s in range(missing.shape[2]):
+                worse = max(missing[run, uav, s] - spare_m, 0.0) - here
+                if worse > few_m[run]:
+                    distance[run] = min(distance[run], ahead_m[s])
+                if worse > many_m[run]:
+                    squeezed[run] = min(squeezed[run], ahead_m[s])
+            for a in range(2):
+                aside[run] = max(aside[run], abs(way[0, a] - offset[run, uav, a]))
+            for s in range(min(bends, way.shape[0]) - 1):
+                left, up = (way[s + 1, 0] - way[s, 0]) / step_m, (way[s + 1, 1] - way[s, 1]) / step_m
+                slope[run] = max(slope[run], math.sqrt(left * left + up * up))
 
 
 @compiled_bare

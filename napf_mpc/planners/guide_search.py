@@ -448,6 +448,15 @@ def _plan_runs(
         )  # fmt: skip
 
 
+@compiled_bare
+def _largest_scene(scene_start: NDArray[np.int64]) -> int:
+    """Most solids of a scene; 0 without scenes."""
+    most = 0
+    for scene in range(len(scene_start) - 1):
+        most = max(most, scene_start[scene + 1] - scene_start[scene])
+    return most
+
+
 class _Kept(threading.local):
     """Scratch of this thread, kept from plan to plan: fresh memory would cost as much as the plan."""
 
@@ -488,9 +497,8 @@ def plan_all(
     busy: NDArray[np.bool_],
 ) -> None:
     """Plan all runs that are due, each from its own scene and state alone; see :func:`plan_run`."""
-    largest = int(np.diff(scene_start).max(initial=0))
     # Powers of two, so that scenes of different size share scratch.
-    most = min(MOST_SOLIDS, 1 << max(largest - 1, 1).bit_length())
+    most = min(MOST_SOLIDS, 1 << max(_largest_scene(scene_start) - 1, 1).bit_length())
     _plan_runs(
         solids, boxes, scene_start, frame, field, due, along, offset, lanes, covariance, separation, last,
         stuck, search, profiles, missing, kept, paid, busy,
@@ -504,3 +512,15 @@ def resample_all(profiles: Array, shift_m: Array, step_m: float, out: Array) -> 
     for r in range(profiles.shape[0]):
         for i in range(profiles.shape[1]):
             resample(profiles[r, i], shift_m[r, i], step_m, out[r, i])
+
+
+@compiled
+def resample_taut(
+    taut: Array, loose: Array, room: Array, shift_m: Array, step_m: float, out_taut: Array, out_loose: Array,
+    out_room: Array,
+) -> None:  # fmt: skip
+    """The same of taut ways (run, uav, station, 2), and of how loose and roomy they are (..., station)."""
+    shape = (*loose.shape, 1)
+    resample_all(taut, shift_m, step_m, out_taut)
+    resample_all(loose.reshape(shape), shift_m, step_m, out_loose.reshape(shape))
+    resample_all(room.reshape(shape), shift_m, step_m, out_room.reshape(shape))

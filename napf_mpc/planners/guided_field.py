@@ -124,7 +124,7 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
 
 def waiting_reasons(guide: Guide) -> NDArray[np.int8]:
     """Codes of :class:`~napf_mpc.planners.planner.Reason` for UAVs that guidance holds."""
-    return _HELD[guide.reason]
+    return _HELD.take(guide.reason)
 
 
 _HELD = np.zeros(len(Passage), dtype=np.int8)

@@ -30,7 +30,7 @@ from napf_mpc.planners.guidance import Guidance, guidance_covariance
 from napf_mpc.planners.guide import Guide
 from napf_mpc.planners.guided_field import waiting_reasons
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
-from napf_mpc.planners.planner import Command, Reason
+from napf_mpc.planners.planner import Command
 from napf_mpc.planners.references import SlotReference
 from napf_mpc.planners.tally import COLUMNS, COUNTED, Tally
 from napf_mpc.problem import FormationMission, Problem
@@ -70,7 +70,6 @@ _COLUMN = np.array(
 )
 _ITERATIONS = COLUMNS.index("iterations")
 _SHORT = COLUMNS.index("margin_short")
-_NO_REASON = int(Reason.NONE)
 
 
 def default_constraints(problem: Problem) -> list[Constraint]:
@@ -205,6 +204,7 @@ class QpPlanner:
         self._last_horizon: Horizon | None = None
         self._made_s: Array = np.full((runs, uavs), -np.inf)
         self._anchor: Array = np.repeat(self._lanes[None], runs, axis=0)
+        self._yaws: Array = np.full((runs, uavs), self._yaw)
         if self._guidance is not None:
             self._guidance.reset(obstacles, runs)
         self.ladder = Ladder(runs, uavs)
@@ -223,7 +223,7 @@ class QpPlanner:
         reference, way = self._references(state, carried, nav, covariance, trusted, None)
         guess, _ = self._guess(state, way, carried, time_s)
         horizon = self._horizon(guess, covariance, nav, trusted, time_s)
-        return self._programs(state, reference, horizon)
+        return self._programs(state, _place(state), reference, horizon)
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
         """Solve this step's programs and command what was accepted, or what the ladder says."""
@@ -235,9 +235,10 @@ class QpPlanner:
         if self._inflation.safety == "protection_level":
             # A place held by a fix without a level would move with its error: hold by velocity.
             placed = trusted | np.isfinite(nav.position).all(-1)
-        np.copyto(self._anchor, nav.position, where=placed[..., None])
+        passes.keep_place(plain(nav.position), placed, self._anchor)
         self._descent.note(nav, trusted)
         state = self._state(nav, trusted)
+        place = _place(state)
         carried = self._carried(state, time_s)
         covariance = self._covariance(nav, trusted, self._planned(state, carried))
         guide = None
@@ -245,21 +246,20 @@ class QpPlanner:
             expected = self.problem.planner.covariance in ("expected", "mapped")
             room = guidance_covariance(nav, trusted, covariance[:, :, -1] if expected else None)
             # Raw measurements jump by more than a taut way could gain.
-            flying = np.asarray(airborne.any(-1))
             guide = self._guidance.step(
-                state[..., POSITION], room, trusted, time_s, taut=nav.filtered, flying=flying,
+                place, room, trusted, time_s, taut=nav.filtered, flying=_runs_with(airborne),
                 sigma_map=nav.sigma_map, measured=not nav.filtered,
             )  # fmt: skip
         reference, way = self._references(state, carried, nav, covariance, trusted, guide)
         began = 0.0 if self._clock is None else self._clock()
         guess = self._guess(state, way, carried, time_s)
-        answer = self._solve(state, reference, guess, covariance, nav, trusted, time_s)
+        answer = self._solve(state, place, reference, guess, covariance, nav, trusted, time_s)
         late = self._clock is not None and not self._clock() - began <= self._period_s
         refused = refusals(answer, self._limits)
         accepted, upset = np.empty((2, *trusted.shape), dtype=np.bool_)
         everybody = passes.accept(refused, state, trusted, late, UPSET_RAD, upset, accepted)
         causes = None if everybody else _causes(answer, refused, upset, late, trusted, airborne)
-        flown, action = self._choose(time_s, state, answer, accepted, trusted & ~upset, causes)
+        flown, action = self._choose(time_s, state, place, answer, accepted, trusted, upset, causes)
         self._plan, self._answer = flown, answer
         slack = self._contact_slack(answer, flown, accepted)
         passes.count(
@@ -268,7 +268,7 @@ class QpPlanner:
         )  # fmt: skip
         if self._short is not None:
             short = self._counts[_SHORT]
-            self._short.count(nav.position_covariance, nav.common_factor, trusted, short)
+            self._short.count(nav.covariance, nav.common_factor, trusted, short)
         return self._command(action, trusted, flown, guide, slack, answer)
 
     def _command(
@@ -282,22 +282,24 @@ class QpPlanner:
     ) -> Command:
         """Fly the plans; where the ladder says so, hold the last known place, or go down there."""
         position, velocity, direction = vectors = np.empty((3, *self._anchor.shape))
-        planned, reason = np.empty(trusted.shape, dtype=np.bool_), np.empty(trusted.shape, dtype=np.int8)
-        passes.command(action, trusted, flown.initial, self._anchor, vectors, planned, reason)
-        if guide is not None:
-            reason = np.maximum(reason, waiting_reasons(guide))
+        planned, holding = np.empty((2, *trusted.shape), dtype=np.bool_)
+        reason = np.empty(trusted.shape, dtype=np.int8)
+        waiting = np.zeros_like(reason) if guide is None else waiting_reasons(guide)
+        passes.command(
+            action, trusted, flown.initial, self._anchor, waiting, vectors, planned, holding, reason
+        )
         return Command(
             position=position,
             velocity=velocity,
             direction=direction,
-            yaw=np.full(trusted.shape, self._yaw),
-            holding=reason > _NO_REASON,
+            yaw=self._yaws.copy(),
+            holding=holding,
             feedforward=np.zeros((*trusted.shape, 4)),
             plan=flown,
             planned=planned,
             reason=reason,
             slack_m=slack,
-            solver_status=_WORDS[answer.status],
+            solver_status=_WORDS.take(answer.status),
         )
 
     def _to_be_corrected(self, nav: NavSolution, trusted: Mask, covariance: Array) -> Array:
@@ -386,14 +388,13 @@ class QpPlanner:
     ) -> Horizon:
         position, velocity = np.empty((2, *guess.shape[:3], 3))
         passes.places(plain(guess), position, velocity)
-        shared = _shared_ahead(nav, covariance)
         return Horizon(
             time_s=time_s,
             step_s=self._model.step_s,
             position=cut_at_obstacles(position, self._obstacles),
             velocity=velocity,
             covariance=covariance,
-            common_factor=shared if trusted.all() else np.where(trusted[..., None, None], shared, 0.0),
+            common_factor=_shared_ahead(nav, trusted, covariance),
             obstacles=self._obstacles,
             frame=self._frame,
             problem=self.problem,
@@ -408,23 +409,22 @@ class QpPlanner:
         else:
             fixes = asked != "propagated"
             covariance = nav.position_covariance_ahead(self._model.times_s, fixes, places)
-        return (
-            covariance if trusted.all() else np.where(trusted[..., None, None, None], covariance, np.eye(3))
-        )
+        if passes.everybody(trusted):
+            return covariance
+        return np.where(trusted[..., None, None, None], covariance, np.eye(3))
 
     def _planned(self, state: Array, carried: tuple[Array, Array] | None) -> Array | None:
         """Places (run, uav, N, 3) of the last plans, at first straight ahead; None without a sigma map."""
         if self.problem.planner.covariance != "mapped":
             return None
         if carried is not None:
-            return np.ascontiguousarray(carried[0][..., POSITION])
+            return _place(carried[0])
         assert isinstance(self.problem.mission, FormationMission)
         way = self.problem.mission.speed_mps * self._model.times_s[:, None] * self._frame.along
         return np.asarray(state[:, :, None, POSITION] + way)
 
-    def _programs(self, state: Array, reference: Array, horizon: Horizon) -> HorizonQp:
+    def _programs(self, state: Array, origin: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
-        origin = np.ascontiguousarray(state[..., POSITION])
         blocks: list[LinearRows] = [constraint.rows(horizon) for constraint in self.constraints]
         outlines = [horizon.shape, *[block.outline() for block in blocks]]
         if outlines != self._outlines:
@@ -432,11 +432,13 @@ class QpPlanner:
                 block.check_shapes(horizon.shape, constraint.name)
             self._outlines = outlines
         blocks = [block.shifted(origin) if block.signal == "position" else block for block in blocks]
-        return HorizonQp(self._model, _moved(state, -origin), _moved(reference, -origin), tuple(blocks))
+        initial = _moved(state[:, :, None], origin, -1.0)[:, :, 0]
+        return HorizonQp(self._model, initial, _moved(reference, origin, -1.0), tuple(blocks))
 
     def _solve(
         self,
         state: Array,
+        origin: Array,
         reference: Array,
         guess: tuple[Array, Array],
         covariance: Array,
@@ -445,17 +447,16 @@ class QpPlanner:
         time_s: float,
     ) -> BatchResult:
         """Answers in the world's coordinates, after as many passes as the problem asks for."""
-        states, inputs = guess
-        origin, answer = np.ascontiguousarray(state[..., POSITION]), self._answer
-        asked: Mask = np.asarray(trusted.any(-1))
+        (states, inputs), answer = guess, self._answer
+        asked = _runs_with(trusted)
         for turn in range(self.problem.planner.passes):
             if turn and answer is not None:
                 better = np.asarray(np.isfinite(answer.states).all(axis=(2, 3), keepdims=True))
                 states = np.where(better, _moved(answer.states, origin), states)
                 inputs = np.where(better, answer.inputs, inputs)
             self._last_horizon = self._horizon(states, covariance, nav, trusted, time_s)
-            programs = self._programs(state, reference, self._last_horizon)
-            warm = None if answer is None else answer.warm_start(_moved(states, -origin), inputs)
+            programs = self._programs(state, origin, reference, self._last_horizon)
+            warm = None if answer is None else answer.warm_start(_moved(states, origin, -1.0), inputs)
             answer = self._answer_to(programs, warm, asked)
             if turn + 1 < self.problem.planner.passes:
                 # The last pass is counted with what becomes of it.
@@ -479,16 +480,18 @@ class QpPlanner:
         self,
         time_s: float,
         state: Array,
+        origin: Array,
         answer: BatchResult,
         accepted: Mask,
-        sound: Mask,
+        trusted: Mask,
+        upset: Mask,
         causes: NDArray[np.object_] | None,
     ) -> tuple[Plan, Codes]:
         """Plans that fly from now on, and by which rung of the ladder; no causes if all were accepted."""
         old, step_s = self._plan, self._model.step_s
         new = Plan(
-            self.problem.vehicle, self._yaw, time_s, step_s, state,
-            _moved(answer.states, np.ascontiguousarray(state[..., POSITION])), plain(answer.inputs),
+            self.problem.vehicle, self._yaw, time_s, step_s, state, _moved(answer.states, origin),
+            plain(answer.inputs),
         )  # fmt: skip
         if causes is None:
             self._made_s[:] = time_s
@@ -496,7 +499,7 @@ class QpPlanner:
             return new, self.ladder.all_accepted()
         still = standing_plan(self.problem.vehicle, self._yaw, time_s, step_s, self._anchor)
         # Without navigation nothing tells whether the tail is followed; upset, it cannot be.
-        clear, tail = sound & ~accepted, still
+        clear, tail = trusted & ~upset & ~accepted, still
         if clear.any():
             tail = still if old is None else old.resumed(time_s, step_s)
             clear &= self._clearance(tail) >= 0.0
@@ -525,8 +528,7 @@ class QpPlanner:
         for constraint, slack in zip(self.constraints, answer.slacks, strict=True):
             if isinstance(constraint, ObstacleContact) and self._last_horizon is not None:
                 # Not the slack: a row may ask for less than the margin, see its opening speed.
-                place = np.ascontiguousarray(flown.states[..., POSITION])
-                found = constraint.shortfall(self._last_horizon, place)
+                found = constraint.shortfall(self._last_horizon, _place(flown.states))
             elif isinstance(constraint, MovingObstacleContact):
                 found = slack.max(axis=(2, 3), initial=0.0)
             else:
@@ -534,7 +536,7 @@ class QpPlanner:
             most = found if most is None else np.fmax(most, found)
         if most is None:
             return np.full(accepted.shape, np.nan)
-        return most if accepted.all() else np.where(accepted, most, np.nan)
+        return most if passes.everybody(accepted) else np.where(accepted, most, np.nan)
 
 
 def _solver_of(problem: Problem) -> BatchSolver:
@@ -555,25 +557,34 @@ def _causes(
     return np.where(trusted, causes, np.where(airborne, "navigation", ""))
 
 
-def _shared_ahead(nav: NavSolution, covariance: Array) -> Array:
+def _shared_ahead(nav: NavSolution, trusted: Mask, covariance: Array) -> Array:
     """Factor (run, uav, 3, rank) of what UAVs share of a covariance (run, uav, N, 3, 3) at all stages [m].
 
     What they share shrinks with the rest of an axis, at most as far as at the stage where that is smallest: a
-    relative position must not pass for more certain than it is. What grows is each UAV's own.
+    relative position must not pass for more certain than it is. What grows is each UAV's own. Who is not
+    trusted shares nothing.
     """
-    if not nav.common_factor.any():
-        return nav.common_factor
-    now = np.einsum("...ii->...i", nav.position_covariance)
-    least = np.einsum("...ii->...i", covariance).min(axis=2)
-    scale = np.sqrt(np.clip(least / np.where(now > 0.0, now, np.inf), 0.0, 1.0))
-    return np.asarray(nav.common_factor * scale[..., None])
+    shared = np.empty(nav.common_factor.shape)
+    passes.share(plain(nav.common_factor), plain(nav.covariance), plain(covariance), trusted, shared)
+    return shared
 
 
-def _moved(states: Array, by: Array) -> Array:
-    """States (run, uav, ..., 12) with their positions moved by (run, uav, 3), the same at all stages."""
+def _place(state: Array) -> Array:
+    """Positions (..., 3) of states (..., 12) [m]."""
+    return np.ascontiguousarray(state[..., POSITION])
+
+
+def _runs_with(mask: Mask) -> Mask:
+    """Whether a mask (run, uav) is set for any UAV of each run (run,)."""
+    some = np.empty(len(mask), dtype=np.bool_)
+    passes.anybody(mask, some)
+    return some
+
+
+def _moved(states: Array, by: Array, sign: float = 1.0) -> Array:
+    """States (run, uav, N, 12) with positions moved there or back, by (run, uav, 3) at all stages."""
     out = np.empty(states.shape)
-    runs, uavs = states.shape[:2]
-    passes.move(states.reshape(runs, uavs, -1, STATES), by, out.reshape(runs, uavs, -1, STATES))
+    passes.move(states, by, sign, out)
     return out
 
 

@@ -5,6 +5,8 @@ A formation of four is so few numbers that every array operation costs more than
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +25,36 @@ Codes = NDArray[np.int8]
 _ACCEPTED, _PLAN = int(Refusal.NONE), int(Action.PLAN)
 _TAIL, _DESCEND = int(Action.TAIL), int(Action.DESCEND)
 _NO_REASON, _NAVIGATION, _SOLVER = int(Reason.NONE), int(Reason.NAVIGATION), int(Reason.SOLVER)
+
+
+@compiled_bare
+def everybody(mask: Mask) -> bool:
+    """Whether a mask (run, uav) is set for all."""
+    for run in range(mask.shape[0]):
+        for uav in range(mask.shape[1]):
+            if not mask[run, uav]:
+                return False
+    return True
+
+
+@compiled_bare
+def anybody(mask: Mask, some: Mask) -> None:
+    """Write whether a mask (run, uav) is set for any UAV of each run (run,)."""
+    for run in range(mask.shape[0]):
+        found = False
+        for uav in range(mask.shape[1]):
+            found = found or mask[run, uav]
+        some[run] = found
+
+
+@compiled_bare
+def keep_place(position: Array, placed: Mask, anchor: Array) -> None:
+    """Write positions (run, uav, 3) over the last known ones, where there is a place."""
+    for run in range(anchor.shape[0]):
+        for uav in range(anchor.shape[1]):
+            if placed[run, uav]:
+                for a in range(3):
+                    anchor[run, uav, a] = position[run, uav, a]
 
 
 @compiled_bare
@@ -57,15 +89,15 @@ def follow(states: Array, now: Array, moved: Array) -> None:
 
 
 @compiled_bare
-def move(states: Array, by: Array, out: Array) -> None:
-    """Write states (run, uav, N, 12) with their positions moved by (run, uav, 3), the same at all stages."""
+def move(states: Array, by: Array, sign: float, out: Array) -> None:
+    """Write states (run, uav, N, 12) with positions moved there or back, by (run, uav, 3) at all stages."""
     for run in range(states.shape[0]):
         for uav in range(states.shape[1]):
             for k in range(states.shape[2]):
                 for i in range(STATES):
                     out[run, uav, k, i] = states[run, uav, k, i]
                 for axis in range(3):
-                    out[run, uav, k, 2 * axis] += by[run, uav, axis]
+                    out[run, uav, k, 2 * axis] += sign * by[run, uav, axis]
 
 
 @compiled_bare
@@ -108,6 +140,24 @@ def _along(state: Array, origin: Array, along: Array) -> float:
 
 
 @compiled_bare
+def share(factor: Array, now: Array, ahead: Array, trusted: Mask, shared: Array) -> None:
+    """Write what is left of factors (run, uav, 3, rank) where an axis' variance is least; 0 without trust.
+
+    Covariances come as (run, uav, 6, 6) of now and (run, uav, N, 3, 3) of a plan's stages.
+    """
+    for run in range(shared.shape[0]):
+        for uav in range(shared.shape[1]):
+            for a in range(3):
+                least, variance, part = np.inf, now[run, uav, a, a], 0.0
+                for k in range(ahead.shape[2]):
+                    least = min(least, ahead[run, uav, k, a, a])
+                if trusted[run, uav] and variance > 0.0:
+                    part = math.sqrt(min(max(least / variance, 0.0), 1.0))
+                for c in range(shared.shape[3]):
+                    shared[run, uav, a, c] = factor[run, uav, a, c] * part if trusted[run, uav] else 0.0
+
+
+@compiled_bare
 def places(states: Array, position: Array, velocity: Array) -> None:
     """Write positions and velocities (run, uav, N, 3) of states (run, uav, N, 12)."""
     for run in range(states.shape[0]):
@@ -136,15 +186,21 @@ def accept(
 
 @compiled_bare
 def command(
-    action: Codes, trusted: Mask, initial: Array, anchor: Array, vectors: Array, planned: Mask, reason: Codes
+    action: Codes, trusted: Mask, initial: Array, anchor: Array, waiting: Codes, vectors: Array,
+    planned: Mask, holding: Mask, reason: Codes,
 ) -> None:  # fmt: skip
-    """Write position, velocity and direction (3, run, uav, 3), who follows a plan, and why one does not."""
+    """Write position, velocity and direction (3, run, uav, 3), who follows a plan, who holds, and why.
+
+    Why a guide lets UAVs wait comes as codes (run, uav); the larger code tells.
+    """
     for run in range(action.shape[0]):
         for uav in range(action.shape[1]):
             code = action[run, uav]
             follows = code <= _TAIL
             planned[run, uav] = follows
-            reason[run, uav] = _NO_REASON if follows else _SOLVER if trusted[run, uav] else _NAVIGATION
+            own = _NO_REASON if follows else _SOLVER if trusted[run, uav] else _NAVIGATION
+            reason[run, uav] = max(own, waiting[run, uav])
+            holding[run, uav] = reason[run, uav] > _NO_REASON
             for a in range(3):
                 down = -DESCENT_MPS if code == _DESCEND and a == 2 else 0.0
                 vectors[0, run, uav, a] = initial[run, uav, 2 * a] if follows else anchor[run, uav, a]

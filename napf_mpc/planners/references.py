@@ -128,17 +128,11 @@ class SlotReference:
         assert guide.loose is not None
         room = np.zeros_like(guide.loose) if guide.room is None else guide.room
         shape = (*here.behind.shape, len(times_s))
-        ways = Ways(
-            np.zeros((*shape, STATES)),
-            np.zeros((*shape, STATES)),
-            np.zeros((*shape, STATES)),
-            np.empty(shape),
-            np.empty(shape),
-        )
+        ways = Ways(*np.zeros((3, *shape, STATES)), *np.empty((2, *shape)))
         _write_ways(
-            here, plain(self.offsets), self.speed_mps, plain(guide.pace), plain(guide.ahead_m),
+            *here, plain(self.offsets), self.speed_mps, plain(guide.pace), plain(guide.ahead_m),
             plain(guide.offset), plain(guide.taut), plain(guide.loose), plain(room), guide.reason,
-            plain(times_s), self.frame.origin, self.frame.axes, self.frame.heading_rad, ways,
+            plain(times_s), self.frame.origin, self.frame.axes, self.frame.heading_rad, *ways,
         )  # fmt: skip
         return ways
 
@@ -211,11 +205,12 @@ def _write_one(
 
 @compiled
 def _write_ways(
-    here: Here, slots: Array, speed_mps: float, pace: Array, ahead_m: Array, bend: Array, taut: Array,
-    loose: Array, room_m: Array, reason: NDArray[np.int8], times_s: Array, origin: Array, axes: Array,
-    heading_rad: float, ways: Ways,
+    position: Array, place: Array, sigma_m: Array, behind: Array, slots: Array, speed_mps: float, pace: Array,
+    ahead_m: Array, bend: Array, taut: Array, loose: Array, room_m: Array, reason: NDArray[np.int8],
+    times_s: Array, origin: Array, axes: Array, heading_rad: float, way: Array, pulled: Array, free: Array,
+    loosely: Array, outwards: Array,
 ) -> None:  # fmt: skip
-    """Write the ways of a guide; arrays of states come as zeros.
+    """Write the :class:`Ways` of a guide from :class:`Here`; arrays of states come as zeros.
 
     UAVs that hold have no taut way: theirs is the guide's, and none of it is loose.
     """
@@ -223,30 +218,30 @@ def _write_ways(
     spacing, last = ahead_m[1] - ahead_m[0], len(ahead_m) - 1
     for run in range(pace.shape[0]):
         for uav in range(pace.shape[1]):
-            position, place, sigma_m = here.position[run, uav], here.place[run, uav], here.sigma[run, uav]
-            behind, speed = here.behind[run, uav], speed_mps * pace[run, uav]
+            at, on, sigma = position[run, uav], place[run, uav], sigma_m[run, uav]
+            late, speed = behind[run, uav], speed_mps * pace[run, uav]
             holds = reason[run, uav] >= HOLD
-            found, free, loosely = bend[run, uav], ways.free[run, uav], ways.loose[run, uav]
+            found, lane = bend[run, uav], free[run, uav]
             _write_one(
-                position, place, slots[uav], sigma_m, behind, speed, ahead_m, found, times_s, axes,
-                heading_rad, room, ways.way[run, uav],
+                at, on, slots[uav], sigma, late, speed, ahead_m, found, times_s, axes, heading_rad, room,
+                way[run, uav],
             )  # fmt: skip
             _write_one(
-                position, place, slots[uav], sigma_m, behind, speed, ahead_m,
-                found if holds else taut[run, uav], times_s, axes, heading_rad, room, ways.pulled[run, uav],
+                at, on, slots[uav], sigma, late, speed, ahead_m, found if holds else taut[run, uav], times_s,
+                axes, heading_rad, room, pulled[run, uav],
             )  # fmt: skip
             _write_one(
-                position, place, slots[uav], sigma_m, behind, speed, ahead_m, level, times_s, axes,
-                heading_rad, room, free,
+                at, on, slots[uav], sigma, late, speed, ahead_m, level, times_s, axes, heading_rad, room,
+                lane,
             )  # fmt: skip
             for n in range(len(times_s)):
-                x, y, z = free[n, 0] - origin[0], free[n, 2] - origin[1], free[n, 4] - origin[2]
+                x, y, z = lane[n, 0] - origin[0], lane[n, 2] - origin[1], lane[n, 4] - origin[2]
                 along = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2]
-                at = min(max((along - place[0]) / spacing, 0.0), float(last))
-                station = min(int(at), last - 1)
-                loosely[n] = 0.0 if holds else loose[run, uav, station]
+                ahead = min(max((along - on[0]) / spacing, 0.0), float(last))
+                station = min(int(ahead), last - 1)
+                loosely[run, uav, n] = 0.0 if holds else loose[run, uav, station]
                 nearby = min(room_m[run, uav, station], room_m[run, uav, station + 1])
-                ways.room[run, uav, n] = 0.0 if holds else nearby
+                outwards[run, uav, n] = 0.0 if holds else nearby
 
 
 @compiled_bare

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from napf_mpc.world.bounding_tree import BoxTree, plant
 from napf_mpc.world.distance import BASE, CYLINDER, SPHERE, TOP, A, Solids, X, Y, solid_bounds
-from napf_mpc.world.queries import largest_count, near_all, nearest_all
+from napf_mpc.world.queries import all_finite, largest_count, near_all, nearest_all
 from napf_mpc.world.shapes import Shape, pack, unpack
 
 LEAF = 4
@@ -308,7 +308,7 @@ def _finite(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
         raise ValueError(
             f"{name} has shape {array.shape}, must have three axes, the last of length {columns}"
         )
-    if not np.isfinite(array).all():
+    if not all_finite(array):
         r, k, _ = np.argwhere(~np.isfinite(array))[0]
         raise ValueError(f"{name}[{r}, {k}] = {array[r, k].tolist()}, must be finite")
     return array

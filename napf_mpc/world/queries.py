@@ -11,6 +11,17 @@ from napf_mpc.world.distance import BASE, SPHERE, A, Solids, X, Y, ball_distance
 
 
 @compiled_bare
+def all_finite(points: NDArray[np.float64]) -> bool:
+    """Whether all coordinates of points (run, point, 3) are finite."""
+    for r in range(points.shape[0]):
+        for k in range(points.shape[1]):
+            for axis in range(points.shape[2]):
+                if not np.isfinite(points[r, k, axis]):
+                    return False
+    return True
+
+
+@compiled_bare
 def nearest_obstacle(
     solids: Solids,
     tree: BoxTree,

@@ -12,7 +12,7 @@ from napf_mpc.block import simulate
 from napf_mpc.constraints.passage import passage_margins
 from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame
-from napf_mpc.planners.guidance import Guidance
+from napf_mpc.planners.guidance import Guidance, _largest_sigma, _measure, _note
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_band import Band, solve_band
 from napf_mpc.planners.guide_settings import GuidanceSettings
@@ -20,7 +20,7 @@ from napf_mpc.planners.guided_field import STRICT, GuidedNapfPlanner
 from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
-from napf_mpc.safety_distance import Inflation
+from napf_mpc.safety_distance import Inflation, directional_sigma, rms_sigma
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Shape, Sphere
 
@@ -366,8 +366,11 @@ def test_between_plans_all_that_is_asked_moves_with_the_uav() -> None:
     assert first.taut is not None
     assert later.loose is not None
     assert later.taut is not None
+    assert first.room is not None
+    assert later.room is not None
     assert first.loose.min() < 0.9
-    pairs = [(first.loose, later.loose)]
+    assert first.room.max() > 1.0
+    pairs = [(first.loose, later.loose), (first.room, later.room)]
     pairs += [(first.taut[..., a], later.taut[..., a]) for a in range(2)]
     pairs += [(first.offset[..., a], later.offset[..., a]) for a in range(2)]
     for at_first, at_last in pairs:
@@ -493,3 +496,51 @@ def test_the_band_solver_solves() -> None:
     wanted = np.linalg.solve(full, band.right.ravel())
     solve_band(band)
     np.testing.assert_allclose(band.right.ravel(), wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_what_is_decided_from_is_measured_as_arrays_would() -> None:
+    """Ways with breaches here and there, of three runs; the last keeps all margins."""
+    rng, runs, stations, step_m, bends = np.random.default_rng(3), 3, 12, 0.5, 5
+    missing = np.maximum(rng.normal(0.0, 1.0, (runs, 4, stations)), 0.0)
+    missing[2] = 0.05
+    profiles, offset = rng.normal(size=(runs, 4, stations, 2)), rng.normal(size=(runs, 4, 2))
+    ahead_m, few, many = step_m * np.arange(float(stations)), rng.uniform(0.1, 0.3, runs), np.full(runs, 1.0)
+    breach = np.maximum(missing - 0.1, 0.0)
+    worse = breach - np.maximum(breach[..., 0], breach[..., 1])[..., None]
+    pieces = np.diff(profiles[:, :, :bends], axis=2) / step_m
+    wanted = [
+        *(np.where(worse > t[:, None, None], ahead_m, np.inf).min((-1, -2)) for t in (few, many)),
+        np.abs(profiles[:, :, 0] - offset).max((-1, -2)),
+        np.sqrt(pieces[..., 0] ** 2 + pieces[..., 1] ** 2).max((-1, -2)),
+    ]
+    found = np.empty((4, runs))
+    _measure(missing, profiles, offset, ahead_m, 0.1, few, many, bends, step_m, *found)
+    np.testing.assert_array_equal(found, wanted)
+    assert np.isinf(found[:2, 2]).all()
+    assert np.isfinite(found[:2, :2]).all()
+
+
+def test_the_largest_sigma_of_a_run_is_that_of_its_covariances() -> None:
+    root = np.random.default_rng(4).normal(size=(5, 4, 3, 3))
+    covariance, sigma = root @ root.swapaxes(-1, -2), np.empty(5)
+    _largest_sigma(covariance, sigma)
+    np.testing.assert_array_equal(sigma, rms_sigma(covariance).max(-1))
+
+
+def test_what_is_trusted_is_noted_and_placed_on_the_path() -> None:
+    path, rng = PathFrame.from_angles((1.0, 2.0, 3.0), 0.7, 0.1), np.random.default_rng(5)
+    (position, known), root = rng.normal(size=(2, 2, 4, 3)), rng.normal(size=(2, 2, 4, 3, 3))
+    covariance, known_covariance = root @ root.swapaxes(-1, -2)
+    trusted = rng.random((2, 4)) < 0.5
+    assert trusted.any()
+    assert not trusted.all()
+    wanted = np.where(trusted[..., None], position, known)
+    certain = np.where(trusted[..., None, None], covariance, known_covariance)
+    position[~trusted], covariance[~trusted] = np.nan, np.nan
+    place, (along, sigma) = np.empty((2, 4, 3)), np.empty((2, 2, 4))
+    _note(position, covariance, trusted, path.origin, path.axes, known, known_covariance, place, along, sigma)
+    np.testing.assert_array_equal(known, wanted)
+    np.testing.assert_array_equal(known_covariance, certain)
+    np.testing.assert_array_equal(place, path.to_path(wanted))
+    np.testing.assert_array_equal(along, place[..., 0])
+    np.testing.assert_allclose(sigma, directional_sigma(certain, path.along), rtol=1e-12)
