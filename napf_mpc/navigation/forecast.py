@@ -225,6 +225,7 @@ def variance_ahead(
                 to_new -= 1
                 _forget(c, memory, noise)
                 if with_fixes:
+                    measured = 0
                     for lane in range(LANES):
                         r, i, a = place[0, lane], place[1, lane], place[2, lane]
                         size = sigma[r, i, min(k, sigma.shape[2] - 1), a]
@@ -232,8 +233,10 @@ def variance_ahead(
                         sigma_at[lane] = size
                         by_place[lane] = usable and (fix or fixless_axis[a])
                         by_speed[lane] = usable and fix
-                    _measured_place(c, sigma_at, position_noise, by_place)
-                    _measured_speed(c, velocity_noise, by_speed)
+                        measured += by_place[lane]
+                    if measured > 0:
+                        _measured_place(c, sigma_at, position_noise, by_place)
+                        _measured_speed(c, velocity_noise, by_speed)
                 if to_new == 0:
                     to_new = epochs_per_new
             for lane in range(last - first):
