@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -72,8 +71,11 @@ class Horizon:
 
     @property
     def times_s(self) -> Array:
-        """(N,) time from now at the end of each stage, kept: nobody may write into it [s]."""
-        return _ends(plain(self.step_s).tobytes())
+        """(N,) time from now at the end of each stage [s]."""
+        if "times_s" not in self.memo:
+            self.memo["times_s"] = np.cumsum(self.step_s)
+        times: Array = self.memo["times_s"]
+        return times
 
     def check(self) -> None:
         """Refuse a horizon whose arrays do not fit each other or are not finite.
@@ -113,16 +115,7 @@ class Horizon:
 
 def even_prices(shape: tuple[int, ...], w1: float, w2: float) -> tuple[Array, Array]:
     """Prices of slacks (run, uav, N, m), the same for all."""
-    linear, quadratic = np.empty(shape), np.empty(shape)
-    linear.fill(w1)
-    quadratic.fill(w2)
-    return linear, quadratic
-
-
-@lru_cache(maxsize=16)
-def _ends(step_s: bytes) -> Array:
-    """Ends (N,) of stages of some lengths, kept: nobody may write into them [s]."""
-    return np.cumsum(np.frombuffer(step_s))
+    return np.full(shape, w1), np.full(shape, w2)
 
 
 def along_rows(jac: Array, signal: Array) -> Array:
