@@ -32,11 +32,11 @@ from napf_mpc.solvers.kernel_rows import HIGH, LOW, W1, W2, WIDTH, RowPlaces, Ro
 from napf_mpc.solvers.kernel_signals import SignalMaps
 from napf_mpc.solvers.kernel_sweep import (
     Lanes,
-    clear,
     read_signals,
     stationarity,
     sweep,
     take,
+    unload,
 )
 
 ROUGH, UNUSABLE, ALONE = 3, 4, 5
@@ -145,7 +145,7 @@ def load(maps: SignalMaps, program: Program, work: WorkingSet, lanes: Lanes, lan
 @compiled_apart
 def under_load(maps: SignalMaps, program: Program, work: WorkingSet, room: Room, lanes: Lanes) -> None:
     """Plan and exact signals under the working set's multipliers, in the only lane."""
-    clear(lanes.loads)
+    unload(lanes)
     load(maps, program, work, lanes, 0)
     sweep(maps, lanes, True)
     read_signals(maps, lanes, 0, room.exact)
@@ -320,7 +320,7 @@ def certify(
     for k in range(n):
         for i in range(STATES):
             z[at, k * STATES + i] = lanes.states[k, i, lane]
-            y[at, k * STATES + i] = lanes.costates[k, i, lane]
+            y[at, k * STATES + i] = -lanes.gradient[k, i, lane]
         for i in range(INPUTS):
             z[at, n * STATES + k * INPUTS + i] = lanes.inputs[k, i, lane]
     off, largest, product = out[2], out[3], out[4]
@@ -472,9 +472,9 @@ def solve_programs(
         How each program ended, and after how many steps.
     """
     for u in range(len(programs)):
-        take(maps, lanes, u, initial, reference, programs[u])
+        take(lanes, u, initial, reference, programs[u])
     sweep(maps, lanes, False)
-    clear(lanes.loads)
+    unload(lanes)
     for u in range(len(programs)):
         if table.sound[u] == 0 or lanes.lost[u] > 0:
             kept.end[u] = UNUSABLE
@@ -496,7 +496,7 @@ def solve_programs(
             if not certify(program, table, u, work, room, lanes, u, i, z, y) <= PLAIN:
                 end = ALONE
         if end == ALONE:
-            take(maps, single, 0, initial, reference, i)
+            take(single, 0, initial, reference, i)
             g = i if warm else 0
             end = solve_alone(
                 maps, program, table, u, work, room, single, i, warm, guess_z, guess_y, g, limit, z, y

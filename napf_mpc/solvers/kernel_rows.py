@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from napf_mpc.constraints.constraint import SIGNALS
 from napf_mpc.jit import compiled
 from napf_mpc.qp import STATES, Array, Index, Layout
-from napf_mpc.solvers.kernel_signals import FIRST, KINDS, Small
+from napf_mpc.solvers.kernel_signals import FIRST, KINDS
+from napf_mpc.solvers.kernel_tape import Small
 
 WIDTH = 4
 """Signals that a row may use: positions, velocities and attitudes leave the last one empty."""

@@ -12,12 +12,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse.csgraph import connected_components
 
 from napf_mpc.constraints.constraint import SIGNALS
 from napf_mpc.qp import INPUTS, STATES, Array, HorizonModel, Index, QpError
+from napf_mpc.solvers.kernel_tape import Matrices, Small, Tape, tape_of
 
 KINDS = tuple(SIGNALS)
 """Kinds of signals in the order of their numbers."""
@@ -27,8 +27,6 @@ TARGETS = np.array(
 """(13,) place of each signal in the state, or 12 and its place in the input."""
 FIRST = np.cumsum([0, *(len(SIGNALS[kind]) for kind in KINDS)])[:-1]
 """(4,) number of the first signal of each kind."""
-A, B, Q, R, CLOSED, GAIN, PULL, INVERSE, TO_GO = range(9)
-"""Matrices of a stage: the model's; A - B K, K, H^-1 B' and H^-1; the optimal cost from its end on."""
 NOISE = 1e-14
 """Entries of a weight below this part of what its diagonal allows are rounding."""
 LOOSE = 1e-13
@@ -37,21 +35,11 @@ FLAT = 1e-13
 """Least eigenvalue of a stage's scaled Hessian: below it the cost does not determine the inputs."""
 
 
-Small = NDArray[np.uint32]
-"""Places that are never negative: the compiled loops need not ask."""
-
-
 class SignalMaps(NamedTuple):
-    """A model as the compiled loops need it: matrices as lists of their entries, and the signal kernel."""
+    """A model as the compiled loops need it: its sweeps, and the signal kernel."""
 
-    begins: Index
-    """(9, N + 1) where the entries of each matrix and stage begin, see :data:`A` to :data:`TO_GO`."""
-    row: Small
-    """(entries,)."""
-    column: Small
-    """(entries,)."""
-    value: Array
-    """(entries,)."""
+    tape: Tape
+    """See :mod:`~napf_mpc.solvers.kernel_tape`."""
     kernel: Array
     """(13 N, 13 N) signal kernel; signals chain by chain, stages of one signal in a row."""
     begin: Index
@@ -77,7 +65,6 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
         If the cost leaves an input undetermined: the method starts from the unconstrained optimum.
     """
     n = model.stages
-    t = (0, 2, 1)
     closed, gain = np.empty((n, STATES, STATES)), np.empty((n, INPUTS, STATES))
     inverse, root = np.empty((n, INPUTS, INPUTS)), np.empty((n, INPUTS, INPUTS))
     to_go = np.empty((n, STATES, STATES))
@@ -102,10 +89,10 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
     place[order] = np.arange(len(TARGETS))
     at = (order[:, None] * n + np.arange(n)).ravel()
     chain_of = np.repeat(chain[order], n)
-    pull = inverse @ model.b.transpose(t)
-    matrices = (model.a, model.b, model.q, model.r, closed, gain, pull, inverse, to_go)
+    pull = inverse @ model.b.transpose(0, 2, 1)
+    matrices = Matrices(model.a, model.b, model.q, model.r, closed, gain, pull, inverse, to_go)
     return SignalMaps(
-        *_entries(matrices),
+        tape_of(matrices),
         np.ascontiguousarray(kernel[np.ix_(at, at)]),
         np.searchsorted(chain_of, chain_of, side="left").astype(np.int64),
         np.searchsorted(chain_of, chain_of, side="right").astype(np.int64),
@@ -120,22 +107,6 @@ def _cleaned(weight: Array) -> Array:
     """Weight without entries that are rounding, such as a Riccati solver leaves between the chains."""
     size = np.sqrt(np.maximum(np.diag(weight), 0.0))
     return np.where(np.abs(weight) <= NOISE * size[:, None] * size, 0.0, weight)
-
-
-def _entries(matrices: tuple[Array, ...]) -> tuple[Index, Small, Small, Array]:
-    """Where each matrix and stage begins; row, column and value of all entries that are not zero."""
-    stages = len(matrices[0])
-    begins = np.empty((len(matrices), stages + 1), dtype=np.int64)
-    rows, columns, values, count = [], [], [], 0
-    for which, matrix in enumerate(matrices):
-        stage, row, column = np.nonzero(matrix)
-        begins[which] = count + np.searchsorted(stage, np.arange(stages + 1))
-        rows.append(row)
-        columns.append(column)
-        values.append(matrix[stage, row, column])
-        count += len(stage)
-    places = [np.concatenate(v).astype(np.uint32) for v in (rows, columns)]
-    return begins, places[0], places[1], np.concatenate(values)
 
 
 def _inverse_root(hessian: Array, stage: int) -> Array:

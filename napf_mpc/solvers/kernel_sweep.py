@@ -1,8 +1,7 @@
 """Plans of many programs side by side: the sweep that makes them, and how well they balance.
 
-A matrix of the model has few entries, and a sweep is a chain of sums that wait for each other. Programs are
-therefore taken side by side, in *lanes*: each entry is read once and serves all of them. No sum runs over
-lanes, so that a plan is the same to the last bit whatever stands beside it.
+The sums stand on a :mod:`tape <napf_mpc.solvers.kernel_tape>`; a program has a *lane* of the plane on which
+it is played.
 """
 
 from __future__ import annotations
@@ -13,36 +12,48 @@ import numpy as np
 
 from napf_mpc.jit import compiled_apart, compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
-from napf_mpc.solvers.kernel_signals import CLOSED, GAIN, INVERSE, PULL, TO_GO, A, B, Q, R, SignalMaps
+from napf_mpc.solvers.kernel_signals import SignalMaps
+from napf_mpc.solvers.kernel_tape import (
+    BALANCE,
+    BOTH,
+    FREE,
+    GRADIENT,
+    LARGEST,
+    LINEAR,
+    LOADED,
+    LOADS,
+    MOVED,
+    PLAN,
+    PULLED,
+    PUSH,
+    REFERENCE,
+    START,
+    TERMS,
+    WEIGHED,
+    first_places,
+    play,
+)
 
 
 class Lanes(NamedTuple):
-    """Plans of some programs, and room for their sweeps; the lane is the last axis."""
+    """Plans of some programs; the lane is the last axis. All but the last two share the plane's memory."""
 
+    plane: Array
+    """(place, lane) see :mod:`~napf_mpc.solvers.kernel_tape`."""
+    flat: Array
+    """(place lane,)."""
     start: Array
-    """(1, 12, lane) states now."""
+    """(12, lane) states now."""
     reference: Array
     """(N, 12, lane)."""
-    linear: Array
-    """(N, 12, lane) -Q ref."""
     loads: Array
     """(N, 16, lane) rows times their multipliers, by state and input."""
-    feed: Array
-    """(N, 4, lane)."""
-    push: Array
-    """(N, 4, lane) linear cost of the inputs."""
-    cost: Array
-    """(N, 12, lane) linear part of the optimal cost from the end of each stage on."""
     states: Array
     """(N, 12, lane)."""
     inputs: Array
     """(N, 4, lane)."""
-    costates: Array
-    """(N, 12, lane) multipliers of the dynamics."""
-    weighed: Array
-    """(N, 16, lane)."""
-    carried: Array
-    """(N, 16, lane)."""
+    gradient: Array
+    """(N, 12, lane) of the optimal cost from the end of each stage on: minus the dynamics' multipliers."""
     lost: Index
     """(lane,) numbers of the plan that are not finite."""
     balance: Array
@@ -51,54 +62,33 @@ class Lanes(NamedTuple):
     @classmethod
     def empty(cls, stages: int, count: int) -> Lanes:
         """Room for so many programs."""
-        state, push = (stages, STATES, count), (stages, INPUTS, count)
-        both = (stages, STATES + INPUTS, count)
+        first = first_places(stages)
+        plane = np.zeros((first[-1], count))
+
+        def block(which: int, each: int) -> Array:
+            return plane[first[which] : first[which + 1]].reshape(-1, each, count)
+
         return cls(
-            np.zeros((1, STATES, count)), np.zeros(state), np.zeros(state), np.zeros(both), np.zeros(push),
-            np.zeros(push), np.zeros(state), np.zeros(state), np.zeros(push), np.zeros(state), np.zeros(both),
-            np.zeros(both), np.zeros(count, dtype=np.int64), np.zeros((6, count)),
+            plane, plane.reshape(-1), block(START, STATES)[0], block(REFERENCE, STATES), block(LOADS, BOTH),
+            block(PLAN, STATES), block(PUSH, INPUTS), block(GRADIENT, STATES),
+            np.zeros(count, dtype=np.int64), np.zeros((TERMS, count)),
         )  # fmt: skip
 
 
 @compiled_bare
-def add(
-    maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
-) -> None:
-    """Add ``sign matrix vector[at]`` of a matrix of stage k to ``out[to, first:]``.
-
-    Arrays come whole with indices: views of them cost more than the sums.
-    """
-    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
-        value, row, column = sign * maps.value[e], first + maps.row[e], maps.column[e]
-        for lane in range(out.shape[2]):
-            out[to, row, lane] += value * vector[at, column, lane]
+def unload(lanes: Lanes) -> None:
+    """Take all loads away."""
+    for k in range(lanes.loads.shape[0]):
+        for i in range(lanes.loads.shape[1]):
+            for lane in range(lanes.loads.shape[2]):
+                lanes.loads[k, i, lane] = 0.0
 
 
 @compiled_bare
-def add_turned(
-    maps: SignalMaps, which: int, k: int, sign: float, vector: Array, at: int, out: Array, to: int, first: int
-) -> None:
-    """The same of the matrix's transpose."""
-    for e in range(maps.begins[which, k], maps.begins[which, k + 1]):
-        value, row, column = sign * maps.value[e], first + maps.column[e], maps.row[e]
-        for lane in range(out.shape[2]):
-            out[to, row, lane] += value * vector[at, column, lane]
-
-
-@compiled_bare
-def clear(values: Array) -> None:
-    """Zero an array of lanes."""
-    for k in range(values.shape[0]):
-        for i in range(values.shape[1]):
-            for lane in range(values.shape[2]):
-                values[k, i, lane] = 0.0
-
-
-@compiled_bare
-def take(maps: SignalMaps, lanes: Lanes, lane: int, starts: Array, references: Array, at: int) -> None:
+def take(lanes: Lanes, lane: int, starts: Array, references: Array, at: int) -> None:
     """Put a program's state now and its reference into a lane."""
     for i in range(STATES):
-        lanes.start[0, i, lane] = starts[at, i]
+        lanes.start[i, lane] = starts[at, i]
         for k in range(references.shape[1]):
             lanes.reference[k, i, lane] = references[at, k, i]
 
@@ -106,45 +96,10 @@ def take(maps: SignalMaps, lanes: Lanes, lane: int, starts: Array, references: A
 @compiled_apart
 def sweep(maps: SignalMaps, lanes: Lanes, loaded: bool) -> None:
     """Optimal states and inputs for the model's cost and the references, under the loads if there are any."""
-    n = lanes.linear.shape[0]
-    if not loaded:
-        clear(lanes.linear)
-        for k in range(n):
-            add(maps, Q, k, -1.0, lanes.reference, k, lanes.linear, k, 0)
-    clear(lanes.feed)
-    clear(lanes.states)
-    clear(lanes.inputs)
-    for k in range(n):
-        for i in range(STATES):
-            for lane in range(lanes.cost.shape[2]):
-                lanes.cost[k, i, lane] = lanes.linear[k, i, lane]
-            if loaded:
-                for lane in range(lanes.cost.shape[2]):
-                    lanes.cost[k, i, lane] -= lanes.loads[k, i, lane]
-        if loaded:
-            for i in range(INPUTS):
-                for lane in range(lanes.push.shape[2]):
-                    lanes.push[k, i, lane] = -lanes.loads[k, STATES + i, lane]
-    for k in range(n - 1, -1, -1):
-        add(maps, PULL, k, -1.0, lanes.cost, k, lanes.feed, k, 0)
-        if loaded:
-            add(maps, INVERSE, k, -1.0, lanes.push, k, lanes.feed, k, 0)
-        if k == 0:
-            break
-        add_turned(maps, CLOSED, k, 1.0, lanes.cost, k, lanes.cost, k - 1, 0)
-        if loaded:
-            add_turned(maps, GAIN, k, -1.0, lanes.push, k, lanes.cost, k - 1, 0)
-    for k in range(n):
-        for i in range(INPUTS):
-            for lane in range(lanes.inputs.shape[2]):
-                lanes.inputs[k, i, lane] = lanes.feed[k, i, lane]
-        before, at = (lanes.states, k - 1) if k > 0 else (lanes.start, 0)
-        add(maps, GAIN, k, -1.0, before, at, lanes.inputs, k, 0)
-        add(maps, A, k, 1.0, before, at, lanes.states, k, 0)
-        add(maps, B, k, 1.0, lanes.inputs, k, lanes.states, k, 0)
+    play(maps.tape, LOADED if loaded else FREE, lanes.plane)
     for lane in range(len(lanes.lost)):
         lanes.lost[lane] = 0
-    for k in range(n):
+    for k in range(lanes.states.shape[0]):
         for i in range(STATES):
             # NaN fails every comparison.
             for lane in range(len(lanes.lost)):
@@ -165,64 +120,63 @@ def read_signals(maps: SignalMaps, lanes: Lanes, lane: int, signals: Array) -> N
 
 
 @compiled_bare
-def widen_bound(bounds: Array, which: int, values: Array, k: int, i: int) -> None:
-    """Let a bound of each lane grow to the size of a number."""
-    for lane in range(values.shape[2]):
-        size = abs(values[k, i, lane])
-        bounds[which, lane] = size if size > bounds[which, lane] else bounds[which, lane]
+def grow(flat: Array, largest: np.uint64, numbers: np.uint64, count: np.uint64) -> None:
+    """Let numbers of the flat plane grow to the size of others, place by place."""
+    for i in range(count):
+        size, own = abs(flat[numbers + i]), flat[largest + i]
+        flat[largest + i] = size if size > own else own
 
 
 @compiled_apart
 def stationarity(maps: SignalMaps, lanes: Lanes) -> None:
-    """Multipliers of the dynamics, and how well states and inputs balance model, cost and loads.
+    """Gradient of the optimal cost, and how well states and inputs balance model, cost and loads.
 
-    The multipliers are minus the gradient of the optimal cost from each stage on; the balance is taken of the
-    model's own matrices. It is the largest violation of the dynamics and its largest term, the largest entry
-    of the Lagrangian's gradient and its largest term, the largest multiplier times violation of the dynamics
-    and its largest term. A number that is not finite is lost; the sweep has counted those.
+    The balance is taken of the model's own matrices. It is the largest violation of the dynamics and its
+    largest term, the largest entry of the Lagrangian's gradient and its largest term, the largest multiplier
+    times violation of the dynamics and its largest term. A number that is not finite is lost; the sweep has
+    counted those.
     """
-    n = lanes.linear.shape[0]
-    clear(lanes.weighed)
-    clear(lanes.carried)
-    for e in range(6):
-        for lane in range(lanes.balance.shape[1]):
+    flat, first, count = lanes.flat, maps.tape.first, lanes.plane.shape[1]
+    # Unsigned, so that the compiler need not think of indices from the end, and vectorises.
+    state, both = np.uint64(STATES * count), np.uint64(BOTH * count)
+    weighed, pulled = np.uint64(first[WEIGHED] * count), np.uint64(first[PULLED] * count)
+    moved, largest = np.uint64(first[MOVED] * count), np.uint64(first[LARGEST] * count)
+    for i in range(np.uint64(TERMS) * both):
+        flat[largest + i] = 0.0
+    for k in range(lanes.states.shape[0] - 1, -1, -1):
+        play(maps.tape, BALANCE + k, lanes.plane)
+        loads = np.uint64((first[LOADS] + BOTH * k) * count)
+        linear = np.uint64((first[LINEAR] + STATES * k) * count)
+        states = np.uint64((first[PLAN] + STATES * k) * count)
+        gradient = np.uint64((first[GRADIENT] + STATES * k) * count)
+        for i in range(both):
+            flat[pulled + i] = (flat[loads + i] - flat[weighed + i]) - flat[pulled + i]
+        for i in range(state):
+            flat[pulled + i] -= flat[linear + i] - flat[gradient + i]
+        at = largest + np.uint64(2) * both
+        grow(flat, at, pulled, both)
+        at += both
+        grow(flat, at, weighed, both)
+        grow(flat, at, linear, state)
+        grow(flat, at, gradient, state)
+        grow(flat, at + state, loads + state, both - state)
+        for i in range(state):
+            flat[moved + i] -= flat[states + i]
+        grow(flat, largest, moved, state)
+        grow(flat, largest + both, states, state)
+        # Products with the multipliers, in place of what is no longer needed.
+        for i in range(state):
+            flat[moved + i] *= flat[gradient + i]
+        for i in range(state):
+            flat[weighed + i] = flat[states + i] * flat[gradient + i]
+        at += both
+        grow(flat, at, moved, state)
+        grow(flat, at + both, weighed, state)
+    for e in range(TERMS):
+        for lane in range(count):
             lanes.balance[e, lane] = 0.0
-    for k in range(n):
-        for i in range(STATES):
-            for lane in range(lanes.cost.shape[2]):
-                lanes.costates[k, i, lane] = -lanes.cost[k, i, lane]
-    for k in range(n - 1, -1, -1):
-        add(maps, TO_GO, k, -1.0, lanes.states, k, lanes.costates, k, 0)
-        add(maps, Q, k, 1.0, lanes.states, k, lanes.weighed, k, 0)
-        if k + 1 < n:
-            add_turned(maps, A, k + 1, 1.0, lanes.costates, k + 1, lanes.carried, k, 0)
-        add(maps, R, k, 1.0, lanes.inputs, k, lanes.weighed, k, STATES)
-        add_turned(maps, B, k, 1.0, lanes.costates, k, lanes.carried, k, STATES)
-        for i in range(STATES + INPUTS):
-            widen_bound(lanes.balance, 3, lanes.weighed, k, i)
-            for lane in range(lanes.carried.shape[2]):
-                lanes.carried[k, i, lane] += lanes.loads[k, i, lane] - lanes.weighed[k, i, lane]
-            if i < STATES:
-                widen_bound(lanes.balance, 3, lanes.linear, k, i)
-                widen_bound(lanes.balance, 3, lanes.costates, k, i)
-                for lane in range(lanes.carried.shape[2]):
-                    lanes.carried[k, i, lane] -= lanes.linear[k, i, lane] + lanes.costates[k, i, lane]
-            else:
-                widen_bound(lanes.balance, 3, lanes.loads, k, i)
-            widen_bound(lanes.balance, 2, lanes.carried, k, i)
-    # The dynamics, the other way round than in the sweep, in place of what is no longer needed.
-    clear(lanes.weighed)
-    for k in range(n):
-        add(maps, B, k, 1.0, lanes.inputs, k, lanes.weighed, k, 0)
-        before, at = (lanes.states, k - 1) if k > 0 else (lanes.start, 0)
-        add(maps, A, k, 1.0, before, at, lanes.weighed, k, 0)
-        for i in range(STATES):
-            for lane in range(lanes.weighed.shape[2]):
-                lanes.weighed[k, i, lane] -= lanes.states[k, i, lane]
-            widen_bound(lanes.balance, 0, lanes.weighed, k, i)
-            widen_bound(lanes.balance, 1, lanes.states, k, i)
-            for lane in range(lanes.weighed.shape[2]):
-                lanes.weighed[k, i, lane] *= lanes.costates[k, i, lane]
-                lanes.carried[k, i, lane] = lanes.states[k, i, lane] * lanes.costates[k, i, lane]
-            widen_bound(lanes.balance, 4, lanes.weighed, k, i)
-            widen_bound(lanes.balance, 5, lanes.carried, k, i)
+        for i in range(BOTH):
+            row = first[LARGEST] + BOTH * e + i
+            for lane in range(count):
+                size = lanes.plane[row, lane]
+                lanes.balance[e, lane] = size if size > lanes.balance[e, lane] else lanes.balance[e, lane]
