@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from napf_mpc.block import Missions, simulate
     from napf_mpc.campaign import compare, run_campaign
     from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
-    from napf_mpc.errors import DataError, NapfError, OutputError, ProblemError, SceneError
+    from napf_mpc.errors import DataError, NapfError, NavigationError, OutputError, ProblemError, SceneError
     from napf_mpc.navigation.solution import NavSolution
     from napf_mpc.planners.mpc import QpPlanner
     from napf_mpc.planners.planner import Command, Planner
@@ -37,6 +37,7 @@ _HOMES = {
     "NapfError": "errors",
     "NapfPlanner": "planners.potential_field",
     "NavSolution": "navigation.solution",
+    "NavigationError": "errors",
     "OutputError": "errors",
     "Planner": "planners.planner",
     "Problem": "problem",
@@ -64,6 +65,7 @@ __all__ = [
     "NapfError",
     "NapfPlanner",
     "NavSolution",
+    "NavigationError",
     "OutputError",
     "Planner",
     "Problem",

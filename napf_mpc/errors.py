@@ -32,6 +32,10 @@ class DataError(NapfError, ValueError):
     """A data file (city, navigation log, result) is missing, unreadable or inconsistent."""
 
 
+class NavigationError(NapfError, ValueError):
+    """A planner is told what it cannot plan with: shapes that do not fit, or a time that goes back."""
+
+
 class SceneError(NapfError, ValueError):
     """A scene cannot be built as asked, for example more obstacles than fit."""
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.errors import NavigationError
 from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.navigation.fix import coasting_variance
 from napf_mpc.navigation.forecast import CovarianceForecast
@@ -145,18 +146,66 @@ class NavSolution:
             out += share
         return out
 
+    def check(self, runs: int, uavs: int) -> None:
+        """Raise unless all arrays have the shapes that are documented here, for so many runs and UAVs.
+
+        Raises
+        ------
+        NavigationError
+            If one has not; it names all that have not.
+        """
+        many = runs, uavs
+        vectors, factor = (*many, 3), self.common_factor
+        told: list[tuple[str, object, tuple[int, ...]]] = [
+            ("available", self.available, many),
+            ("position", self.position, vectors),
+            ("velocity", self.velocity, vectors),
+            ("attitude", self.attitude, vectors),
+            ("body_rates", self.body_rates, vectors),
+            ("covariance", self.covariance, (*many, 6, 6)),
+            ("common_factor", factor, (*vectors, factor.shape[3] if np.ndim(factor) == 4 else -1)),
+        ]
+        if self.airborne is not None:
+            told.append(("airborne", self.airborne, many))
+        if self.protection is not None:
+            told.append(("protection", self.protection, (*many, 2)))
+        if self.disputed is not None:
+            told.append(("disputed", self.disputed, many))
+        if self.lasting is not None:
+            told.append(("lasting", self.lasting, (*vectors, 3)))
+        if self.forecast is not None:
+            told.append(("forecast.fixes", self.forecast.fixes, many))
+        faults = []
+        for name, values, want in told:
+            if getattr(values, "shape", None) != want:
+                faults.append(_misfit(name, values, want))
+            elif want is many and isinstance(values, np.ndarray) and values.dtype.kind != "b":
+                faults.append(f"{name} has type {values.dtype}, must be bool")
+        if faults:
+            hint = "; call the planner's reset(obstacles, runs) first" if runs == 0 else ""
+            raise NavigationError("; ".join(faults) + hint)
+
     def trusted(self) -> NDArray[np.bool_]:
         """(run, uav): a fix is there, all numbers are finite, and the covariance of the position is one.
 
         A variance of zero, a negative one or NaN means "unknown", never "certain", and so does a matrix with
-        a negative eigenvalue or one that is not symmetric: such a solution is not to be planned with.
+        a negative eigenvalue or one that is not symmetric, or a part that UAVs share which is more than the
+        whole: such a solution is not to be planned with.
         """
         trusted = np.empty(self.available.shape, dtype=np.bool_)
         _sound(
             self.available, plain(self.position), plain(self.velocity), plain(self.attitude),
-            plain(self.body_rates), plain(self.covariance), trusted,
+            plain(self.body_rates), plain(self.covariance), plain(self.common_factor), trusted,
         )  # fmt: skip
         return trusted
+
+
+def _misfit(name: str, values: object, want: tuple[int, ...]) -> str:
+    """What is wrong with a value's shape, in words; -1 stands for any length."""
+    must = str(want).replace("-1", "rank")
+    if not isinstance(values, np.ndarray):
+        return f"{name} is a {type(values).__name__}, must be an array {must}"
+    return f"{name} has shape {values.shape}, must be {must}"
 
 
 def _carried_on(now: Array, then: Array, ahead_s: Array) -> tuple[Array, Array]:
@@ -190,7 +239,7 @@ def _stretch(covariance: Array, change: Array, out: Array) -> None:
 @compiled
 def _sound(
     available: Mask, position: Array, velocity: Array, attitude: Array, rates: Array, covariance: Array,
-    sound: Mask,
+    factor: Array, sound: Mask,
 ) -> None:  # fmt: skip
     """Write whether a solution is there, all its numbers are finite, and its position's covariance is one."""
     for run in range(sound.shape[0]):
@@ -200,6 +249,11 @@ def _sound(
                 fine = fine and np.isfinite(position[run, uav, a]) and np.isfinite(velocity[run, uav, a])
                 fine = fine and np.isfinite(attitude[run, uav, a]) and np.isfinite(rates[run, uav, a])
                 fine = fine and covariance[run, uav, a, a] > 0.0
+                shared = 0.0
+                for c in range(factor.shape[3]):
+                    shared += factor[run, uav, a, c] * factor[run, uav, a, c]
+                # NaN fails every comparison.
+                fine = fine and shared <= covariance[run, uav, a, a] * (1.0 + 1e-6)
             for a in range(6):
                 for b in range(6):
                     fine = fine and np.isfinite(covariance[run, uav, a, b])

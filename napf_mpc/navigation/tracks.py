@@ -87,7 +87,7 @@ class Tracks:
         return np.asarray(distance.min(axis=(2, 3), initial=np.inf))
 
     def faults(self, runs: int) -> list[str]:
-        """What does not fit a number of runs or is not finite, in words."""
+        """What does not fit a number of runs, is not finite or no radius, in words."""
         expected = {
             "position": (runs, self.count, 3),
             "velocity": (runs, self.count, 3),
@@ -102,6 +102,8 @@ class Tracks:
                 found.append(f"tracks.{name} has shape {values.shape}, must be {want}")
             elif not np.isfinite(values).all():
                 found.append(f"tracks.{name} has an entry that is not finite")
+        if not found and not (self.radius > 0.0).all():
+            found.append(f"tracks.radius = {self.radius.tolist()}, must be > 0")
         return found
 
     def of_run(self, run: int) -> Tracks:

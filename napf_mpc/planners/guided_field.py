@@ -67,7 +67,7 @@ class GuidedNapfPlanner(PotentialFieldPlanner):
         """Command of all UAVs from the reported solution, the map and the guide."""
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
-        nav = self.inflation.informed(nav)
+        nav = self._told(nav, time_s)
         position, covariance, trusted = self._estimates(nav, time_s)
         ahead = None
         if settings.covariance == "expected":

@@ -33,6 +33,7 @@ from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_pla
 from napf_mpc.planners.planner import Command
 from napf_mpc.planners.references import SlotReference
 from napf_mpc.planners.tally import COLUMNS, COUNTED, Tally
+from napf_mpc.planners.told import check_map, check_told
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem import Planner as Settings
 from napf_mpc.qp import STATES, HorizonQp
@@ -195,7 +196,9 @@ class QpPlanner:
 
     def reset(self, obstacles: ObstacleSet, runs: int) -> None:
         """Take a new map; forget plans, workspaces and fall-backs."""
+        check_map(obstacles, runs)
         uavs = len(self._lanes)
+        self._last_s = -math.inf
         self._obstacles = obstacles
         self._solver.reset()
         self._plan: Plan | None = None
@@ -215,6 +218,7 @@ class QpPlanner:
 
     def build(self, nav: NavSolution, time_s: float) -> HorizonQp:
         """Programs of this step without a guide; the origin is where each UAV is reported to be."""
+        check_told(nav, self.problem, len(self._anchor), time_s, self._last_s)
         nav = self._inflation.informed(nav)
         trusted = nav.trusted()
         state = self._state(nav, trusted)
@@ -226,7 +230,15 @@ class QpPlanner:
         return self._programs(state, _place(state), reference, horizon)
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
-        """Solve this step's programs and command what was accepted, or what the ladder says."""
+        """Solve this step's programs and command what was accepted, or what the ladder says.
+
+        Raises
+        ------
+        NavigationError
+            If the solution does not fit the problem and the runs of :meth:`reset`, see :mod:`.told`.
+        """
+        check_told(nav, self.problem, len(self._anchor), time_s, self._last_s)
+        self._last_s = time_s
         nav = self._inflation.informed(nav)
         airborne = np.ones(nav.available.shape, dtype=bool) if nav.airborne is None else nav.airborne
         trusted = nav.trusted() & airborne

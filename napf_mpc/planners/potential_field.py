@@ -16,6 +16,7 @@ from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.descent import DESCENT_MPS, Descent
 from napf_mpc.planners.planner import Command, Reason
 from napf_mpc.planners.tally import Event, Tally
+from napf_mpc.planners.told import check_map, check_told
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.world.moving import round_distance
@@ -54,6 +55,7 @@ class PotentialFieldPlanner:
         self._lanes = self._frame.to_world(self._offsets * np.array([0.0, 1.0, 1.0]))
         self._descent = Descent(problem)
         self._obstacles = ObstacleSet.empty()
+        self._last_s = -math.inf
         self._anchor: Array = np.zeros((0, 0, 3))
         self._placed: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
         self._down: NDArray[np.bool_] = np.zeros((0, 0), dtype=bool)
@@ -66,7 +68,9 @@ class PotentialFieldPlanner:
 
     def reset(self, obstacles: ObstacleSet, runs: int) -> None:
         """Take a new map and forget where UAVs have been."""
+        check_map(obstacles, runs)
         self._obstacles = obstacles
+        self._last_s = -math.inf
         uavs = len(self._offsets)
         self._anchor = np.repeat(self._lanes[None], runs, axis=0)
         self._placed = np.zeros((runs, uavs), dtype=bool)
@@ -78,7 +82,7 @@ class PotentialFieldPlanner:
         """Command of all UAVs from the reported solution and the map."""
         settings, mission = self.problem.planner, self.problem.mission
         assert isinstance(mission, FormationMission)
-        nav = self.inflation.informed(nav)
+        nav = self._told(nav, time_s)
         position, covariance, trusted = self._estimates(nav, time_s)
         error = synchronisation_error(self._frame.along_track(position), self._offsets[:, 0])
         speed = reference_speed(
@@ -108,6 +112,12 @@ class PotentialFieldPlanner:
             reason=lost_reasons(trusted),
         )
         return self._hold(self._wait(command, nav), trusted)
+
+    def _told(self, nav: NavSolution, time_s: float) -> NavSolution:
+        """Solution that fits, with the covariance that the margins are made of."""
+        check_told(nav, self.problem, len(self._anchor), time_s, self._last_s)
+        self._last_s = time_s
+        return self.inflation.informed(nav)
 
     def _estimates(self, nav: NavSolution, time_s: float) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Positions, their covariances and which of them are trusted; every number finite."""
