@@ -47,6 +47,8 @@ _MOST_IN_VIEW = 32
 _MOST_HYPOTHESES = 6000
 _UNMONITORED = 0.1
 """Part of the probability that faults may have which no hypothesis covers."""
+_UNIT = 2e-6
+"""What the square of a unit vector's length may be off."""
 _CLOSE_M = 0.01
 """A level is rounded up by this at most."""
 
@@ -126,12 +128,21 @@ def protection_levels(
     Raises
     ------
     ValueError
-        If a usable number is not finite, a sigma is not positive, a probability not in [0, 1).
+        If a shape or a type does not fit, a clock is not from 0 to 3, a usable number is not finite, a
+        direction no unit vector, a sigma not positive, or a probability not in [0, 1).
     """
+    directions, ranges, sigma, p_fault = (
+        np.asarray(values, dtype=np.float64) for values in (directions, ranges, sigma, p_fault)
+    )
+    clock, usable = np.asarray(clock), np.asarray(usable)
+    _check_fit(directions, clock, ranges, sigma, p_fault, usable)
     receivers = len(ranges)
     sound = np.isfinite(ranges) & np.isfinite(sigma) & (sigma > 0.0) & (p_fault >= 0.0) & (p_fault < 1.0)
     if not sound[usable].all():
         raise ValueError("ranges must be finite, sigma > 0 and 0 <= p_fault < 1 wherever a range is usable")
+    lengths = np.einsum("...i,...i->...", directions, directions)
+    if not (np.abs(lengths - 1.0) < _UNIT)[usable].all():
+        raise ValueError("directions must be unit vectors wherever a range is usable")
     out = Levels(
         np.full((receivers, 2), np.inf),
         usable.copy(),
@@ -140,10 +151,37 @@ def protection_levels(
         np.zeros(receivers, dtype=np.int64),
     )
     _levels(
-        np.ascontiguousarray(directions), clock, ranges, sigma, p_fault, settings.p_hmi,
-        _alarm_factors(settings.p_false_alarm), out.level_m, out.used, out.excluded, out.why, out.hypotheses,
+        np.ascontiguousarray(directions), clock.astype(np.int64, copy=False), ranges, sigma, p_fault,
+        settings.p_hmi, _alarm_factors(settings.p_false_alarm), out.level_m, out.used, out.excluded, out.why,
+        out.hypotheses,
     )  # fmt: skip
     return out
+
+
+def _check_fit(
+    directions: Array, clock: Index, ranges: Array, sigma: Array, p_fault: Array, usable: Mask
+) -> None:
+    """Refuse what compiled code, which checks no bounds, would read past the end of."""
+    shape = ranges.shape
+    if len(shape) != 2:
+        raise ValueError(f"ranges has shape {shape}, must be (receiver, sat)")
+    for name, given, needed in (
+        ("directions", directions.shape, (*shape, 3)),
+        ("clock", clock.shape, shape[1:]),
+        ("sigma", sigma.shape, shape),
+        ("p_fault", p_fault.shape, shape),
+        ("usable", usable.shape, shape),
+    ):
+        if given != needed:
+            raise ValueError(f"{name} has shape {given}, must be {needed}")
+    if usable.dtype != np.bool_:
+        raise ValueError(f"usable must be an array of bool, got {usable.dtype}")
+    if clock.dtype.kind not in "iu":
+        raise ValueError(f"clock must hold whole numbers from 0 to {_CLOCKS - 1}, got {clock.dtype}")
+    if clock.size and not 0 <= clock.min() <= clock.max() < _CLOCKS:
+        raise ValueError(
+            f"clock must hold whole numbers from 0 to {_CLOCKS - 1}, got {clock.min()} to {clock.max()}"
+        )
 
 
 @cache

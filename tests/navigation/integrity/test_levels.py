@@ -28,7 +28,7 @@ SIGMA = 1.0 + 1.0 / SIGHT[:, 2]
 PLAIN = SolverSettings("plain", exclude=False, max_pdop=1e6)
 
 
-def levels(ranges: np.ndarray, p_fault: float | np.ndarray, **changes: Any) -> Levels:
+def levels(ranges: np.ndarray, p_fault: float | np.ndarray, /, **changes: Any) -> Levels:
     """Levels of receivers under one sky."""
     shape = ranges.shape
     values: dict[str, Any] = {
@@ -193,6 +193,45 @@ def test_more_satellites_than_it_looks_at_lose_the_likelier_faulty() -> None:
 def test_what_is_no_sky(sigma_m: float, p_fault: float) -> None:
     with pytest.raises(ValueError, match="ranges must be finite, sigma > 0 and 0 <= p_fault < 1"):
         levels(np.zeros((1, 14)), p_fault, sigma=np.full((1, 14), sigma_m))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"clock": CLOCK + 5}, r"clock must hold whole numbers from 0 to 3, got 5 to 6"),
+        ({"clock": CLOCK - 1}, r"clock must hold whole numbers from 0 to 3, got -1 to 0"),
+        ({"clock": CLOCK.astype(float)}, r"clock must hold whole numbers from 0 to 3, got float64"),
+        ({"clock": CLOCK[:3]}, r"clock has shape \(3,\), must be \(14,\)"),
+        ({"directions": SIGHT[None, :5]}, r"directions has shape \(1, 5, 3\), must be \(1, 14, 3\)"),
+        ({"sigma": SIGMA}, r"sigma has shape \(14,\), must be \(1, 14\)"),
+        ({"p_fault": np.full(14, 1e-3)}, r"p_fault has shape \(14,\), must be \(1, 14\)"),
+        ({"usable": np.ones((1, 13), dtype=bool)}, r"usable has shape \(1, 13\), must be \(1, 14\)"),
+        ({"usable": np.ones((1, 14), dtype=int)}, r"usable must be an array of bool, got int64"),
+        ({"ranges": np.zeros(14)}, r"ranges has shape \(14,\), must be \(receiver, sat\)"),
+        ({"directions": 10.0 * SIGHT[None]}, r"directions must be unit vectors wherever a range is usable"),
+        ({"directions": np.full((1, 14, 3), np.nan)}, r"directions must be unit vectors wherever"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_together(changes: dict[str, Any], words: str) -> None:
+    """Compiled code checks no bounds: each of these was a crash, or a level of the wrong satellites."""
+    with pytest.raises(ValueError, match=words):
+        levels(np.zeros((1, 14)), 1e-3, **changes)
+
+
+def test_where_no_range_is_usable_directions_may_be_anything() -> None:
+    usable = np.arange(14)[None] != 4
+    sight = np.where(usable[..., None], SIGHT, np.nan)
+    known = levels(np.zeros((1, 14)), 1e-3, usable=usable)
+    np.testing.assert_array_equal(
+        levels(np.zeros((1, 14)), 1e-3, usable=usable, directions=sight).level_m, known.level_m
+    )
+    assert np.isfinite(known.level_m).all()
+
+
+def test_a_clock_of_any_whole_type_is_the_same_clock() -> None:
+    ranges = normals(6, range(1), Stream.OWN_ERROR, 14, 1, 1)[0, :, 0].T * 3.0
+    wide = levels(ranges, 0.01).level_m
+    np.testing.assert_array_equal(levels(ranges, 0.01, clock=CLOCK.astype(np.int8)).level_m, wide)
 
 
 def test_what_cannot_be_asked() -> None:
