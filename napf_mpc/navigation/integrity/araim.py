@@ -76,8 +76,8 @@ class RangeErrors:
     Raises
     ------
     ValueError
-        A shape does not fit, a direction is no unit vector, a sigma is not positive, a probability not in
-        [0, 1).
+        A shape or a type does not fit, a direction is no unit vector, a sigma is not positive, a probability
+        not in [0, 1), or a prior is of a constellation that no range is of.
     """
 
     line_of_sight: Array
@@ -91,14 +91,18 @@ class RangeErrors:
     p_satellite: Array
     """(n,) prior probability that the satellite is faulty."""
     p_constellation: dict[int, float]
-    """Prior probability that a whole constellation is; none given is zero."""
+    """Prior probability that a whole constellation is, by its number; none given is zero."""
     p_nlos: Array | None = None
     """(n,) prior probability that the signal arrives by reflection alone; by default zero."""
     sigma_accuracy_m: Array | None = None
     """(n,) sigma for continuity, the error as it usually is [m]; by default that for integrity."""
 
     def __post_init__(self) -> None:
-        n = len(self.line_of_sight)
+        for name in ("line_of_sight", "sigma_m", "bias_m", "p_satellite", "p_nlos", "sigma_accuracy_m"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _numbers(name, getattr(self, name)))
+        object.__setattr__(self, "constellation", np.asarray(self.constellation))
+        n = len(self.line_of_sight) if self.line_of_sight.ndim else 0
         if self.line_of_sight.shape != (n, 3) or n == 0:
             raise ValueError(
                 f"line_of_sight has shape {self.line_of_sight.shape}, must be (n, 3) with n >= 1"
@@ -110,6 +114,18 @@ class RangeErrors:
             value = getattr(self, name)
             if value is not None and value.shape != (n,):
                 raise ValueError(f"{name} has shape {value.shape}, must be ({n},)")
+        if self.constellation.dtype.kind not in "iu":
+            raise ValueError(
+                f"constellation must hold whole numbers, got {self.constellation.dtype}; number them by "
+                "np.unique(constellation, return_inverse=True)[1]"
+            )
+        present = np.unique(self.constellation).tolist()
+        for key in self.p_constellation:
+            if key not in present:
+                raise ValueError(
+                    f"p_constellation names {key!r}, must be one of constellation: "
+                    f"{', '.join(map(str, present))}"
+                )
         for name in ("sigma_m", "sigma_accuracy_m"):
             value = getattr(self, name)
             if value is not None and not ((value > 0.0) & np.isfinite(value)).all():
@@ -120,6 +136,13 @@ class RangeErrors:
         for p in (*self.p_satellite, *self.p_constellation.values(), *nlos):
             if not 0.0 <= p < 1.0:
                 raise ValueError(f"a prior probability is {p!r}, must be >= 0 and < 1")
+
+
+def _numbers(name: str, values: object) -> Array:
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must hold numbers: {error}") from error
 
 
 @dataclass(frozen=True)

@@ -164,6 +164,34 @@ def test_what_is_no_sky(changes: dict[str, Any]) -> None:
         ranges(**changes)
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"p_constellation": {0: 0.1, 7: 0.9}}, r"p_constellation names 7, must be one of .*: 0, 1"),
+        ({"p_constellation": {"1": 0.9}}, r"p_constellation names '1', must be one of constellation: 0, 1"),
+        ({"constellation": np.array(["GPS"] * 14)}, r"constellation must hold whole numbers, got <U3"),
+        ({"constellation": np.full(14, 0.5)}, r"constellation must hold whole numbers, got float64"),
+        ({"sigma_m": ["a"] * 14}, r"sigma_m must hold numbers"),
+        ({"line_of_sight": [1.0, 0.0, 0.0]}, r"line_of_sight has shape \(3,\), must be \(n, 3\)"),
+    ],
+)  # fmt: skip
+def test_what_names_no_satellite_or_is_no_number(changes: dict[str, Any], words: str) -> None:
+    """A prior of a constellation that is not there would count for nothing, and the level be too small."""
+    with pytest.raises(ValueError, match=words):
+        ranges(**changes)
+
+
+def test_lists_do_as_well_as_arrays() -> None:
+    r = ranges(p_constellation={1: 1e-3}, p_nlos=np.full(14, 1e-3))
+    lists = {
+        f.name: v.tolist() if isinstance(v := getattr(r, f.name), np.ndarray) else v
+        for f in dataclasses.fields(r)
+    }
+    ours, theirs = (protection_level(one, COUNTABLE) for one in (r, RangeErrors(**lists)))
+    assert ours.available
+    np.testing.assert_array_equal(theirs.axis_m, ours.axis_m)
+
+
 # ------------------------------------------------------------------------------------- faults injected
 
 RUNS = 60_000
