@@ -57,8 +57,17 @@ def clustered_rate(hits: NDArray[np.int64], size: int) -> Rate:
         UAVs hit in each run.
     size : int
         UAVs a run.
+
+    Raises
+    ------
+    ValueError
+        If there are no runs or no UAVs, or more UAVs of a run are hit than it has.
     """
     runs = len(hits)
+    if runs < 1 or size < 1:
+        raise ValueError(f"{runs} runs of {size} UAVs: at least one of each is needed")
+    if not 0 <= hits.min() <= hits.max() <= size:
+        raise ValueError(f"hits must be from 0 to size = {size}, got {hits.min()} to {hits.max()}")
     total = runs * size
     count = int(hits.sum())
     value = count / total
@@ -122,8 +131,22 @@ def paired_tests(hits: dict[str, NDArray[np.bool_]]) -> list[Paired]:
     ----------
     hits : dict of str to array of bool, shape (run,)
         Obstacle collision of each run, same runs in the same order for every planner.
+
+    Raises
+    ------
+    ValueError
+        If planners have hits of different numbers of runs.
     """
+    hits = {name: np.asarray(each, dtype=np.bool_) for name, each in hits.items()}
     names = list(hits)
+    for name, each in hits.items():
+        if each.ndim != 1:
+            raise ValueError(f"{name} has hits of shape {each.shape}, must be (run,)")
+        if each.shape != hits[names[0]].shape:
+            raise ValueError(
+                f"{names[0]} has hits of shape {hits[names[0]].shape}, {name} of {each.shape}; "
+                "planners are paired on the same runs"
+            )
     pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
     tables = [
         (

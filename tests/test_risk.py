@@ -109,6 +109,20 @@ def test_clustered_rate_is_an_interval_no_narrower_than_wilson(hits: list[int]) 
     assert rate.high - rate.low >= naive.high - naive.low - 1e-9
 
 
+@pytest.mark.parametrize(
+    ("hits", "size", "words"),
+    [
+        ([], 4, "0 runs of 4 UAVs"),
+        ([0, 0], 0, "2 runs of 0 UAVs"),
+        ([0, 5], 4, "hits must be from 0 to size = 4, got 0 to 5"),
+        ([0, -1], 4, "hits must be from 0 to size = 4, got -1 to 0"),
+    ],
+)
+def test_runs_that_cannot_be_are_refused(hits: list[int], size: int, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        clustered_rate(np.array(hits, dtype=np.int64), size)
+
+
 # --------------------------------------------------------------------------------------------- paired tests
 
 
@@ -149,6 +163,20 @@ def test_pairs_are_counted_on_the_same_runs() -> None:
     assert (bc.only_a, bc.only_b) == (2, 0)
     assert [pair.p_value_corrected for pair in (ab, ac, bc)] == holm([ab.p_value, ac.p_value, bc.p_value])
     assert paired_tests({"apf": a}) == []
+
+
+def test_noughts_and_ones_are_hits_too() -> None:
+    """Inverted bit by bit, integers would count neither = -4."""
+    pair = paired_tests({"a": np.array([1, 1, 0, 0]), "b": np.array([1, 0, 1, 0])})[0]
+    assert (pair.both, pair.only_a, pair.only_b, pair.neither) == (1, 1, 1, 1)
+
+
+def test_planners_must_have_flown_the_same_runs() -> None:
+    one, two = np.array([True]), np.array([True, False])
+    with pytest.raises(ValueError, match=r"a has hits of shape \(2,\), b of \(1,\); .* the same runs"):
+        paired_tests({"a": two, "b": one})
+    with pytest.raises(ValueError, match=r"a has hits of shape \(1, 2\), must be \(run,\)"):
+        paired_tests({"a": two[None], "b": two[None]})
 
 
 def test_a_paired_test_sees_what_two_rates_do_not() -> None:
