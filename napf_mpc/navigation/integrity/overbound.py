@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 
 _TAIL = 0.25  # errors inside the quartiles are nothing that a safety distance of a sigma or more meets
 _WINDOW = 5.0  # correlation times, 1/2 + sum
+_MOST_PERIODS = 10_000_000
 MIN_FIXES = 20
 """Fewer fixes make no overbound, ..."""
 MIN_EFFECTIVE = 5.0
@@ -101,10 +102,33 @@ def effective_sample_size(time_s: Array, values: Array, period_s: float) -> floa
     -------
     float
         From 1 to n; n for a series that does not vary.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or are not (n,) with n >= 1, a value is not finite, times do not ascend or span
+        more than ten million periods, or the period is not a finite number > 0.
     """
-    n = len(values)
+    time_s, values = np.asarray(time_s, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    n = len(values) if values.ndim == 1 else 0
+    if n < 1 or time_s.shape != (n,):
+        raise ValueError(
+            f"time_s has shape {time_s.shape}, values {values.shape}: both must be (n,) with n >= 1"
+        )
+    if not (math.isfinite(period_s) and period_s > 0.0):
+        raise ValueError(f"period_s = {period_s!r} must be a finite number > 0")
+    if not np.isfinite(values).all():
+        raise ValueError("values must be finite; leave out what is not, times are a grid with gaps")
+    if not (np.isfinite(time_s).all() and (np.diff(time_s) > 0.0).all()):
+        raise ValueError("time_s must ascend and be finite; sort the series by time")
+    span = (time_s[-1] - time_s[0]) / period_s
+    if not span <= _MOST_PERIODS:
+        raise ValueError(
+            f"time_s spans {span:.6g} periods, at most {_MOST_PERIODS:.6g} are looked at; cut the series at "
+            "its longest gap"
+        )
     slots = np.round((time_s - time_s[0]) / period_s).astype(np.int64)
-    away = np.asarray(values, dtype=np.float64) - math.fsum(values.tolist()) / n
+    away = values - math.fsum(values.tolist()) / n
     variance = float((away**2).mean())
     if variance <= 0.0 or n < 2:
         return float(n)
@@ -113,11 +137,13 @@ def effective_sample_size(time_s: Array, values: Array, period_s: float) -> floa
     line[slots], here[slots] = away, 1.0
     total = 0.0
     for lag in range(1, len(line)):
+        if lag > _WINDOW * (0.5 + total):
+            break
         pairs = float((here[lag:] * here[:-lag]).sum())
         if pairs == 0.0:
             continue
         correlation = float((line[lag:] * line[:-lag]).sum()) / pairs / variance
-        if correlation <= 0.0 or lag > _WINDOW * (0.5 + total):
+        if correlation <= 0.0:
             break
         total += pairs / n * correlation
     return float(min(n, max(1.0, n / (1.0 + 2.0 * total))))

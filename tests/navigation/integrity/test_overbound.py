@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -94,6 +95,39 @@ def test_correlated_samples_are_worth_less() -> None:
         len(white) / 2 * math.tanh(2.0 / 20.0), rel=0.2
     )
     assert effective_sample_size(time[:50], np.ones(50), 1.0) == 50.0
+
+
+SERIES = DRAWS[0][:30]
+GRID = np.arange(30.0)
+
+
+@pytest.mark.parametrize(
+    ("time_s", "values", "period_s", "words"),
+    [
+        (GRID[::-1], SERIES, 1.0, r"time_s must ascend"),
+        (np.where(GRID == 4, np.nan, GRID), SERIES, 1.0, r"time_s must ascend"),
+        (np.append(GRID[:-1], np.inf), SERIES, 1.0, r"time_s must ascend"),
+        (GRID, SERIES, 0.0, r"period_s = 0.0 must be a finite number > 0"),
+        (GRID, SERIES, np.nan, r"period_s = nan must be a finite number > 0"),
+        (GRID, SERIES[:-1], 1.0, r"time_s has shape \(30,\), values \(29,\)"),
+        (GRID[:0], SERIES[:0], 1.0, r"time_s has shape \(0,\), values \(0,\)"),
+        (GRID[:, None], SERIES[:, None], 1.0, r"time_s has shape \(30, 1\)"),
+        (GRID, np.where(GRID == 4, np.nan, SERIES), 1.0, r"values must be finite"),
+        (np.append(GRID[:-1], 1e12), SERIES, 1.0, r"time_s spans 1e\+12 periods, at most 1e\+07 are looked"),
+    ],
+)  # fmt: skip
+def test_what_is_no_series(time_s: np.ndarray, values: np.ndarray, period_s: float, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        effective_sample_size(time_s, values, period_s)
+
+
+def test_a_long_gap_takes_no_time() -> None:
+    """Two flights of 15 fixes, a day of 10 Hz apart; nothing is correlated over what lies between."""
+    time = np.where(GRID < 15, GRID, GRID + 864_000.0)
+    values = np.where(GRID < 15, -1.0, 1.0) + 0.1 * SERIES
+    began = perf_counter()
+    assert effective_sample_size(time, values, 1.0) == pytest.approx(2.0, abs=0.3)  # two levels
+    assert perf_counter() - began < 10.0
 
 
 @pytest.mark.parametrize("values", [np.ones(19), np.array([np.inf] * 30)])
