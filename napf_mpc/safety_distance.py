@@ -86,13 +86,28 @@ def clearance_margin(covariance: Array, normal: Array, confidence: float) -> Arr
     Raises
     ------
     ValueError
-        If confidence is outside (0, 1), a number is not finite, or a covariance has a negative eigenvalue.
+        If confidence is outside (0, 1), a shape does not fit, a number is not finite, a normal is no unit
+        vector, or a covariance has a negative eigenvalue.
     """
     factor = confidence_factor(confidence)
     covariance = np.asarray(covariance, dtype=float)
     normal = np.asarray(normal, dtype=float)
+    if covariance.shape[-2:] != (3, 3):
+        raise ValueError(f"covariance has shape {covariance.shape}, must be (..., 3, 3)")
+    if normal.shape[-1:] != (3,):
+        raise ValueError(f"normal has shape {normal.shape}, must be (..., 3)")
+    try:
+        np.broadcast_shapes(covariance.shape[:-2], normal.shape[:-1])
+    except ValueError as error:
+        raise ValueError(
+            f"covariance has shape {covariance.shape}, normal {normal.shape}: leading axes must broadcast"
+        ) from error
     if not (np.isfinite(covariance).all() and np.isfinite(normal).all()):
         raise ValueError("covariance and normal must be finite")
+    lengths = np.linalg.norm(normal, axis=-1)
+    astray = np.abs(lengths - 1.0) > 1e-6
+    if astray.any():
+        raise ValueError(f"normal must be unit vectors, one has the length {lengths[astray][0]:.6g}")
     symmetric = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
     lowest = float(np.linalg.eigvalsh(symmetric).min(initial=0.0))
     if lowest < -1e-9 * max(1.0, float(np.abs(covariance).max(initial=0.0))):

@@ -71,7 +71,7 @@ def test_confidence_outside_zero_to_one_is_refused(confidence: float) -> None:
         clearance_margin(np.eye(3), EAST, confidence)
 
 
-@pytest.mark.parametrize("dimensions", [0, -1, 1.5])
+@pytest.mark.parametrize("dimensions", [0, -1, 1.5, math.inf, math.nan])
 def test_dimensions_are_whole(dimensions: Any) -> None:
     with pytest.raises(ValueError, match="dimensions = "):
         confidence_factor(0.9, dimensions)
@@ -133,6 +133,12 @@ def test_sigmas_of_uncorrelated_axes_are_the_axes() -> None:
         (np.diag([1.0, np.inf, 1.0]), EAST, "finite"),
         (np.eye(3), np.array([np.nan, 0.0, 0.0]), "finite"),
         (np.diag([1.0, -1.0, 1.0]), EAST, "negative eigenvalue"),
+        (np.ones(3), EAST, r"covariance has shape \(3,\), must be \(\.\.\., 3, 3\)"),
+        (np.eye(2), EAST, r"covariance has shape \(2, 2\), must be \(\.\.\., 3, 3\)"),
+        (np.eye(3), EAST[:2], r"normal has shape \(2,\), must be \(\.\.\., 3\)"),
+        (np.zeros((4, 3, 3)), np.tile(EAST, (5, 1)), r"covariance has shape \(4, 3, 3\), normal \(5, 3\)"),
+        (np.eye(3), 3.0 * EAST, "normal must be unit vectors, one has the length 3"),
+        (np.eye(3), np.zeros(3), "normal must be unit vectors, one has the length 0"),
         (np.array([(1.0, 2.0, 0.0), (2.0, 1.0, 0.0), (0.0, 0.0, 1.0)]), EAST, "negative eigenvalue"),
         (np.array([(1.0, 4.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]), EAST, "negative eigenvalue"),
     ],

@@ -66,7 +66,7 @@ def student_factor(confidence: float, degrees_of_freedom: float, dimensions: int
 def _check(confidence: float, dimensions: int) -> None:
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence = {confidence!r} must be > 0 and < 1")
-    if dimensions < 1 or dimensions != int(dimensions):
+    if not (math.isfinite(dimensions) and dimensions >= 1 and dimensions == int(dimensions)):
         raise ValueError(f"dimensions = {dimensions!r} must be a whole number >= 1")
 
 
