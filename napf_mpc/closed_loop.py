@@ -21,7 +21,14 @@ from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.jit import compiled
 from napf_mpc.navigation.error_models import position_errors
 from napf_mpc.navigation.filtered import FilteredNavigation
-from napf_mpc.navigation.fix import Fix, FixSource, PlacedErrors, PositionErrors, fixes_of_flight
+from napf_mpc.navigation.fix import (
+    Fix,
+    FixSource,
+    PlacedErrors,
+    PositionErrors,
+    check_shapes,
+    fixes_of_flight,
+)
 from napf_mpc.navigation.gnss import gnss_scene
 from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.gnss_sigma import sigma_map
@@ -339,7 +346,9 @@ class _Unfiltered:
     def solution(self, tick: int, time_s: float, state: Array) -> NavSolution:
         """Issue the solution of a tick, from the true states (run, uav, 12); ticks come from 0 on."""
         if self._held is None or tick % self._ticks_per_fix == 0:
-            fix = self._fixes.fix(tick // self._ticks_per_fix, state[..., POSITION])
+            epoch = tick // self._ticks_per_fix
+            fix = self._fixes.fix(epoch, state[..., POSITION])
+            check_shapes(fix, epoch, *state.shape[:2])
             self._held = fix, _with_velocity(fix.covariance)
         return _solution(time_s, state, *self._held)
 

@@ -375,6 +375,30 @@ def test_navigation_that_goes_blind_fails_its_run_and_no_other() -> None:
             np.testing.assert_array_equal(score.metrics[name][run], good.metrics[name][run], err_msg=name)
 
 
+@dataclass(frozen=True)
+class OfOneRun:
+    """Errors of a scenario's first run, whatever is flown."""
+
+    good: Any
+
+    @property
+    def period_s(self) -> float:
+        return float(self.good.period_s)
+
+    def fix(self, epoch: int) -> Fix:
+        fix = self.good.fix(epoch)
+        return Fix(fix.error[:1], fix.covariance[:1], fix.common_factor[:1], fix.available[:1])
+
+
+@pytest.mark.parametrize("filter_", ["none", "kalman"])
+def test_errors_of_fewer_runs_are_no_failed_runs(filter_: str) -> None:
+    """The second run would have read past the end of the first one's, and been filed as failed."""
+    problem = short("lanes", f"navigation.filter={filter_}")
+    scenario = build_scenario(problem, 4, range(2))
+    with pytest.raises(ValueError, match=r"fix of epoch 0 has error of shape .* must be \(2, 4, 3\)"):
+        fly(problem, NapfPlanner(problem), replace(scenario, errors=OfOneRun(scenario.errors)))
+
+
 def test_a_run_beyond_all_numbers_has_failed() -> None:
     """An estimate 1e6 km off: whatever that run does, the others fly as before."""
     problem = short("lanes")

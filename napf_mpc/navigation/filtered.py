@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from napf_mpc.navigation.filter import KalmanFilter
 from napf_mpc.navigation.filter_model import FilterModel
-from napf_mpc.navigation.fix import FixSource, PlacedErrors, PositionErrors, fixes_of_flight
+from napf_mpc.navigation.fix import FixSource, PlacedErrors, PositionErrors, check_shapes, fixes_of_flight
 from napf_mpc.navigation.gnss_fixes import GnssErrors
 from napf_mpc.navigation.integrity.overbound import Overbound
 from napf_mpc.navigation.monitor import Monitor
@@ -124,12 +124,18 @@ class FilteredNavigation:
             velocity reach it through measurements only.
         active : array of bool, shape (run,)
             Runs that fly; the estimates of others stand still.
+
+        Raises
+        ------
+        ValueError
+            If a fix is of other runs or UAVs than the position.
         """
         if tick > 0:
             self._filter.predict(self._sensors.velocity_change(velocity), active)
         if tick % self._ticks_per_fix == 0:
             epoch = tick // self._ticks_per_fix
             fix = self._fixes.fix(epoch, position)
+            check_shapes(fix, epoch, *position.shape[:2])
             self._overbound = fix.overbound
             covariance = fix.covariance
             if self._lasting is not None:

@@ -16,6 +16,7 @@ __all__ = [
     "FixSource",
     "PlacedErrors",
     "PositionErrors",
+    "check_shapes",
     "coasting_variance",
     "diagonal",
     "fixes_of_flight",
@@ -58,6 +59,31 @@ class Fix:
             if array is None:
                 continue
             array.flags.writeable = False
+
+
+def check_shapes(fix: Fix, epoch: int, runs: int, uavs: int) -> None:
+    """Refuse a fix of other runs or UAVs than are flown: compiled code would read past its end.
+
+    Raises
+    ------
+    ValueError
+        Naming the array, its shape and the one needed.
+    """
+    block = (runs, uavs)
+    rank = fix.common_factor.shape[-1:]
+    for name, array, needed in (
+        ("error", fix.error, (*block, 3)),
+        ("covariance", fix.covariance, (*block, 3, 3)),
+        ("common_factor", fix.common_factor, (*block, 3, *rank)),
+        ("available", fix.available, block),
+        ("protection", fix.protection, (*block, 2)),
+    ):
+        if array is not None and array.shape != needed:
+            words = f"({runs}, {uavs}, 3, rank)" if name == "common_factor" else str(needed)
+            raise ValueError(
+                f"fix of epoch {epoch} has {name} of shape {array.shape}, must be {words}: {runs} runs of "
+                f"{uavs} UAVs are flown"
+            )
 
 
 class PositionErrors(Protocol):

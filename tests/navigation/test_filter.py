@@ -401,6 +401,44 @@ class Spoiled:
         return replace(fix, error=error, covariance=covariance)
 
 
+@dataclass(frozen=True)
+class Misshapen:
+    """Errors whose fixes are of the given shapes from the second epoch on."""
+
+    good: PositionErrors
+    changes: dict[str, Any]
+
+    @property
+    def period_s(self) -> float:
+        return self.good.period_s
+
+    def fix(self, epoch: int) -> Fix:
+        fix = self.good.fix(epoch)
+        return replace(fix, **self.changes) if epoch else fix
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"error": np.zeros((1, 3, 3))}, r"error of shape \(1, 3, 3\), must be \(2, 3, 3\)"),
+        ({"error": np.zeros((2, 3))}, r"error of shape \(2, 3\), must be \(2, 3, 3\)"),
+        ({"covariance": np.zeros((1, 3, 3, 3))}, r"covariance of shape .*, must be \(2, 3, 3, 3\)"),
+        ({"covariance": np.zeros((2, 3, 3))}, r"covariance of shape .*, must be \(2, 3, 3, 3\)"),
+        ({"available": np.ones((1, 3), dtype=bool)}, r"available of shape \(1, 3\), must be \(2, 3\)"),
+        ({"common_factor": np.zeros((2, 1, 3, 1))}, r"common_factor of shape .*, must be \(2, 3, 3, rank\)"),
+        ({"common_factor": np.zeros((2, 3, 3))}, r"common_factor of shape .*, must be \(2, 3, 3, rank\)"),
+        ({"protection": np.zeros((1, 3, 2))}, r"protection of shape .*, must be \(2, 3, 2\)"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("kind", ["kalman", "point_mass"])
+def test_a_fix_of_another_shape_is_named(kind: str, changes: dict[str, Any], words: str) -> None:
+    """Compiled filters check no bounds: with too few runs they would read past the end."""
+    config = paper(filter=kind)
+    errors = Misshapen(position_errors(config, 11, range(2), 3, 5.0, None), changes)
+    with pytest.raises(ValueError, match=rf"fix of epoch 1 has {words}"):
+        flown(config, 2.0, runs=2, uavs=3, errors=errors)
+
+
 def spoiled(start_s: float, stop_s: float, config: GaussMarkov | None = None, **what: Any) -> Flown:
     config = config or paper()
     errors = position_errors(config, 11, range(20), UAVS, 45.0, None)
