@@ -41,7 +41,7 @@ FLOORS: list[set[str]] = [
     {"problem_file"},
     {"problem_faults"},
     {"problem"},
-    {"store", "data_folder", "overrides", "stopping"},
+    {"store", "data_folder", "data_file", "overrides", "stopping"},
     {"risk", "first_passage", "shipped", "interrupts", "streams", "jit", "errors", "words"},
 ]
 

@@ -106,12 +106,12 @@ class ErrorLog:
             raise DataError(f"{self.source}: the epoch at {self.time_s[i]:g} s (number {i + 1}) has {what}")
 
 
-def read_error_log_csv(path: Path) -> ErrorLog:
+def read_error_log_csv(path: Path | str) -> ErrorLog:
     """Read a log of errors and reported covariances.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         Comma-separated with a header line: ``t_s``, ``available`` (0 or 1), ``err_e_m``, ``err_n_m``,
         ``err_u_m``, ``cov_ee_m2``, ``cov_en_m2``, ``cov_eu_m2``, ``cov_nn_m2``, ``cov_nu_m2``, ``cov_uu_m2``
         in any order; further columns are left alone. Without a fix the numbers may be empty.
@@ -121,6 +121,7 @@ def read_error_log_csv(path: Path) -> ErrorLog:
     DataError
         The file is missing, not such a file, or holds something unusable (file and line are named).
     """
+    path = Path(path)
     lines = numbered_lines(path)
     _, head = next(lines, (0, ""))
     header = [name.strip() for name in head.split(",")]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from napf_mpc.data_file import readable_file
 from napf_mpc.errors import DataError
 from napf_mpc.navigation.ephemeris import SYSTEMS, Ephemerides
 from napf_mpc.words import shown_text
@@ -36,14 +37,14 @@ def gps_seconds(moment: dt.datetime) -> float:
     return (moment - _GPS_EPOCH).total_seconds()
 
 
-def read_rinex_navigation(path: Path) -> Ephemerides:
+def read_rinex_navigation(path: Path | str) -> Ephemerides:
     """Read the GPS, Galileo (I/NAV) and QZSS records of a navigation file; others are passed over.
 
     A file that was read before and has not changed since is not read again.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         RINEX 3 navigation file, mixed or of one system.
 
     Returns
@@ -57,19 +58,15 @@ def read_rinex_navigation(path: Path) -> Ephemerides:
         The file is missing, not such a file, holds no record of these systems, or a record that is cut short
         or has a number that is missing or out of range (file and line are named).
     """
-    try:
-        stat = path.stat()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from error
+    path = readable_file(path, MAX_BYTES)
+    stat = path.stat()
     return _read_cached(path, stat.st_mtime_ns, stat.st_size)
 
 
 @lru_cache(maxsize=4)
-def _read_cached(path: Path, _changed_ns: int, size: int) -> Ephemerides:
-    if size > MAX_BYTES:
-        raise DataError(f"{path}: {size} bytes, at most {MAX_BYTES} are read")
+def _read_cached(path: Path, _changed_ns: int, _size: int) -> Ephemerides:
     try:
-        text = path.read_text(encoding="ascii")
+        text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not a text file ({error.reason})") from error
     except OSError as error:

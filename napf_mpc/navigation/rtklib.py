@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.data_file import readable_file
 from napf_mpc.errors import DataError
 from napf_mpc.words import shown_text
 
@@ -45,7 +46,7 @@ class PosTrack:
     """(n, 3, 3) as reported, in east, north, up [m^2]; zero where none was given (a ground truth)."""
 
 
-def read_rtklib_pos(path: Path) -> PosTrack:
+def read_rtklib_pos(path: Path | str) -> PosTrack:
     """Read an RTKLIB position file in latitude, longitude and height (degrees).
 
     The cross terms of the file are signed square roots in the order sdne, sdeu, sdun:
@@ -53,7 +54,7 @@ def read_rtklib_pos(path: Path) -> PosTrack:
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         File with RTKLIB's own header line and white-space columns; time as date and clock or as GPS week
         and seconds.
 
@@ -63,6 +64,7 @@ def read_rtklib_pos(path: Path) -> PosTrack:
         The file is missing, not such a file, has a column missing, a line that is no epoch, a number that
         is not finite or out of range, or times that do not ascend.
     """
+    path = Path(path)
     header: list[str] | None = None
     times: list[float] = []
     rows: list[list[float]] = []
@@ -97,13 +99,10 @@ def numbered_lines(path: Path) -> Iterator[tuple[int, str]]:
     Raises
     ------
     DataError
-        The file is missing, too big, or not text.
+        The file is missing, packed, too big, or not text.
     """
+    readable_file(path, _MAX_BYTES)
     try:
-        if not path.is_file():
-            raise DataError(f"{path}: no such file")
-        if path.stat().st_size > _MAX_BYTES:
-            raise DataError(f"{path}: {path.stat().st_size} bytes, at most {_MAX_BYTES} are read")
         with path.open(encoding="utf-8-sig") as file:
             count = 0
             for number, line in enumerate(file, start=1):

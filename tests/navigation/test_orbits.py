@@ -1,6 +1,7 @@
 """Where satellites are: broadcast orbits against another implementation, files, the nominal constellation."""
 
 import datetime as dt
+import gzip
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +107,22 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, words: str)
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"gone\.nav: cannot be read"):
         read_rinex_navigation(tmp_path / "gone.nav")
+
+
+def test_what_is_no_text_file_is_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot be read: is a folder; name a file in it"):
+        read_rinex_navigation(tmp_path)
+    packed = tmp_path / "nav.rnx.gz"
+    packed.write_bytes(gzip.compress((HEADER + record()).encode()))
+    with pytest.raises(DataError, match=r"nav\.rnx\.gz: is packed by gzip; unpack it first"):
+        read_rinex_navigation(packed)
+
+
+def test_a_byte_order_mark_is_no_part_of_the_header(tmp_path: Path) -> None:
+    plain = written(tmp_path, HEADER + record())
+    marked = tmp_path / "marked.nav"
+    marked.write_bytes(b"\xef\xbb\xbf" + plain.read_bytes())
+    assert read_rinex_navigation(str(marked)).name.tolist() == read_rinex_navigation(plain).name.tolist()
 
 
 def carried_on(mean: float, eccentricity: float) -> tuple[float, float]:

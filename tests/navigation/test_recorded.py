@@ -1,6 +1,7 @@
 """Readers of measured logs: what they make of good files, and that bad ones end in a DataError."""
 
 import contextlib
+import gzip
 import math
 from pathlib import Path
 
@@ -144,6 +145,26 @@ def test_what_is_no_text_file_is_refused(tmp_path: Path, read):
     for path in (binary, tmp_path, tmp_path / "missing"):
         with pytest.raises(DataError, match=path.name):
             read(path)
+
+
+@pytest.mark.parametrize("read", [read_error_log_csv, read_rtklib_pos])
+def test_a_folder_and_a_packed_log_are_told_apart(tmp_path: Path, read):
+    packed = tmp_path / "log.csv.gz"
+    packed.write_bytes(gzip.compress(CSV_HEAD.encode()))
+    for path, words in (
+        (packed, r"log\.csv\.gz: is packed by gzip; unpack it first"),
+        (tmp_path, "cannot be read: is a folder; name a file in it"),
+        (tmp_path / "missing", "missing: cannot be read: no such file"),
+    ):
+        with pytest.raises(DataError, match=words):
+            read(path)
+
+
+def test_a_name_as_text_is_read(tmp_path: Path):
+    csv = csv_file(tmp_path, CSV_ROWS)
+    assert read_error_log_csv(str(csv)).source == read_error_log_csv(csv).source
+    pos = write(tmp_path, "log.pos", [*POS_HEAD, pos_row("06:00:00.000", LAT, LON, 10.0, SDS)])
+    assert read_rtklib_pos(str(pos)).source == str(pos)
 
 
 def test_no_covariance_by_rounding_only_is_repaired(tmp_path: Path):

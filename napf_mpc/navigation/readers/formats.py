@@ -14,7 +14,7 @@ from napf_mpc.navigation.rtklib import PosTrack, read_rtklib_pos
 
 __all__ = ["READERS", "SUFFIXES", "format_of", "read_track"]
 
-READERS: dict[str, Callable[[Path], PosTrack]] = {
+READERS: dict[str, Callable[[Path | str], PosTrack]] = {
     "pos": read_rtklib_pos,
     "nmea": read_nmea,
     "ubx": read_ubx,
@@ -53,6 +53,6 @@ def format_of(name: str, told: str, key: str) -> str:
     return SUFFIXES[suffix]
 
 
-def read_track(path: Path, kind: str) -> PosTrack:
+def read_track(path: Path | str, kind: str) -> PosTrack:
     """Positions of a log of the given format, with their reported covariance."""
     return READERS[kind](path)

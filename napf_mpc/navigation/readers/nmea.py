@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.errors import DataError
-from napf_mpc.navigation.readers.track import GPS_EPOCH_UNIX_S, checked_track, open_size, unix_seconds
+from napf_mpc.navigation.readers.track import GPS_EPOCH_UNIX_S, checked_track, log_file, unix_seconds
 from napf_mpc.navigation.rtklib import PosTrack, numbered_lines
 from napf_mpc.words import shown_text
 
@@ -28,7 +28,7 @@ DAY_S = 86_400.0
 _SENTENCE = re.compile(r"\$[A-Z]{2}(GGA|GST|ZDA|RMC),")
 
 
-def read_nmea(path: Path) -> PosTrack:
+def read_nmea(path: Path | str) -> PosTrack:
     r"""Read GGA and GST sentences of an NMEA 0183 log.
 
     The horizontal covariance is that of GST's error ellipse, whose semi-major axis :math:`\sigma_1` lies
@@ -38,7 +38,7 @@ def read_nmea(path: Path) -> PosTrack:
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         Text file, one sentence a line, with checksums. Other sentences are passed over.
 
     Returns
@@ -52,7 +52,7 @@ def read_nmea(path: Path) -> PosTrack:
     DataError
         The file is missing, empty, no such log, or a sentence in it is broken (file and line are named).
     """
-    open_size(path)
+    path = log_file(path)
     clock = _Clock()
     fixes: list[tuple[float, list[float]]] = []
     reports: dict[float, Array] = {}

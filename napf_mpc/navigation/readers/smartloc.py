@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from napf_mpc.errors import DataError
 from napf_mpc.navigation.pseudorange_solution import Check, SolverSettings
 from napf_mpc.navigation.pseudoranges import fix_from_pseudoranges
-from napf_mpc.navigation.readers.track import checked_track, open_size
+from napf_mpc.navigation.readers.track import checked_track, log_file
 from napf_mpc.navigation.rtklib import PosTrack, numbered_lines
 from napf_mpc.words import shown_text
 
@@ -31,12 +31,12 @@ _PLAIN = SolverSettings("plain", exclude=False, max_pdop=1e6)
 _FIELDS = ("t", "range", "variance", "x", "y", "z", "satellite", "system", "elevation", "cn0")
 
 
-def read_smartloc(path: Path) -> PosTrack:
+def read_smartloc(path: Path | str) -> PosTrack:
     """Read a smartLoc log: its ground truth, or the plain solution of its pseudoranges.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         Text file with ``point3`` records (the truth), or with ``pseudorange3`` records. The latter are solved
         epoch by epoch by weighted least squares with a clock a system, above :data:`ELEVATION_MASK_DEG` and
         :data:`CN0_MASK_DBHZ`; an epoch that cannot be solved is left out.
@@ -51,7 +51,7 @@ def read_smartloc(path: Path) -> PosTrack:
     DataError
         The file is missing, empty, no such log, or a record in it is broken (file and line are named).
     """
-    open_size(path)
+    path = log_file(path)
     truth: list[Array] = []
     records: list[Array] = []
     for number, line in numbered_lines(path):

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.data_file import readable_file
 from napf_mpc.errors import DataError
 from napf_mpc.navigation.rtklib import PosTrack
 
-__all__ = ["GPS_EPOCH_UNIX_S", "MAX_BYTES", "checked_track", "open_size", "unix_seconds"]
+__all__ = ["GPS_EPOCH_UNIX_S", "MAX_BYTES", "checked_track", "log_file", "unix_seconds"]
 
 Array = NDArray[np.float64]
 
@@ -28,24 +29,18 @@ def unix_seconds(year: int, month: int, day: int) -> float:
     return (dt.datetime(year, month, day) - _EPOCH).total_seconds()
 
 
-def open_size(path: Path) -> None:
-    """Refuse what is no file, or too big to be read.
+def log_file(path: Path | str) -> Path:
+    """Path of a log that can be read and is not empty.
 
     Raises
     ------
     DataError
         Naming the file and why.
     """
-    try:
-        if not path.is_file():
-            raise DataError(f"{path}: no such file")
-        size = path.stat().st_size
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if size == 0:
+    path = readable_file(path, MAX_BYTES)
+    if path.stat().st_size == 0:
         raise DataError(f"{path}: empty file")
-    if size > MAX_BYTES:
-        raise DataError(f"{path}: {size} bytes, at most {MAX_BYTES} are read")
+    return path
 
 
 def checked_track(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.errors import DataError
-from napf_mpc.navigation.readers.track import GPS_EPOCH_UNIX_S, checked_track, open_size, unix_seconds
+from napf_mpc.navigation.readers.track import GPS_EPOCH_UNIX_S, checked_track, log_file, unix_seconds
 from napf_mpc.navigation.rtklib import PosTrack
 from napf_mpc.words import shown_text
 
@@ -21,7 +21,7 @@ WEEK_S = 604_800.0
 _FIX_3D = (3, 4)  # 3-D, and 3-D with dead reckoning
 
 
-def read_ubx(path: Path) -> PosTrack:
+def read_ubx(path: Path | str) -> PosTrack:
     """Read NAV-PVT and NAV-COV messages of a u-blox receiver's log.
 
     NAV-COV gives the covariance in north, east, down. Without one of the same epoch NAV-PVT's accuracies do:
@@ -30,7 +30,7 @@ def read_ubx(path: Path) -> PosTrack:
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         Binary file; NMEA or RTCM between the messages is passed over.
 
     Returns
@@ -43,7 +43,7 @@ def read_ubx(path: Path) -> PosTrack:
     DataError
         The file is missing, empty, broken, cut off, or has no such messages.
     """
-    open_size(path)
+    path = log_file(path)
     fixes: list[tuple[int, float, list[float], Array]] = []
     reports: dict[int, Array] = {}
     for message in _messages(path):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.errors import DataError
-from napf_mpc.navigation.readers.track import GPS_EPOCH_UNIX_S, checked_track, open_size
+from napf_mpc.navigation.readers.track import GPS_EPOCH_UNIX_S, checked_track, log_file
 from napf_mpc.navigation.rtklib import PosTrack
 from napf_mpc.words import shown_text
 
@@ -35,7 +35,7 @@ _NAMES: dict[str, tuple[tuple[str, float], ...]] = {
 }
 
 
-def read_ulog(path: Path) -> PosTrack:
+def read_ulog(path: Path | str) -> PosTrack:
     """Read the GNSS topic of a PX4 log.
 
     PX4 logs no covariance but accuracies: ``eph`` is taken as the root of the two horizontal variances' sum,
@@ -43,7 +43,7 @@ def read_ulog(path: Path) -> PosTrack:
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         ULog file.
 
     Returns
@@ -56,7 +56,7 @@ def read_ulog(path: Path) -> PosTrack:
     DataError
         The file is missing, empty, no ULog, broken, or without such a topic.
     """
-    open_size(path)
+    path = log_file(path)
     topic, data = _topic(path)
     columns = {name: _column(path, topic, data, name) for name in _NAMES}
     used = (columns["fix_type"] >= _FIX_3D) & (columns["time"] > 0.0)

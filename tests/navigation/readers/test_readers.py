@@ -1,6 +1,7 @@
 """Readers of receivers' logs: written by the formats' own libraries, read back in metres."""
 
 import datetime as dt
+import gzip
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -300,9 +301,30 @@ def test_every_suffix_has_a_reader() -> None:
 
 @pytest.mark.parametrize("kind", sorted(READERS))
 def test_whatever_is_not_there_or_no_file(tmp_path: Path, kind: str) -> None:
-    for path in (tmp_path / "nothing", tmp_path):
-        with pytest.raises(DataError, match="no such file"):
+    for path, words in ((tmp_path / "nothing", "no such file"), (tmp_path, "is a folder; name a file in it")):
+        with pytest.raises(DataError, match=f"{path.name}: cannot be read: {words}"):
             read_track(path, kind)
+
+
+@pytest.mark.parametrize("kind", sorted(READERS))
+def test_a_packed_log_is_to_be_unpacked(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "log.gz"
+    path.write_bytes(gzip.compress(b"point3 0 1 2 3\n"))
+    with pytest.raises(DataError, match=r"log\.gz: is packed by gzip; unpack it first"):
+        read_track(path, kind)
+
+
+def test_names_of_files_do_as_well_as_paths(tmp_path: Path, data_folder: Path) -> None:
+    nmea = written(tmp_path, gga("12:00:00", PLACE))
+    ubx_log(tmp_path / "log.ubx", 3.0)
+    smartloc = data_folder / "gnss_berlin_smartloc" / "Berlin_Potsdamer_Platz_GT.txt"
+    ulog = data_folder / "px4_ulog_sample" / "flight_log_small.ulg"
+    for read, path in (
+        (read_nmea, nmea), (read_ubx, tmp_path / "log.ubx"), (read_smartloc, smartloc), (read_ulog, ulog)
+    ):  # fmt: skip
+        named = read(str(path))
+        np.testing.assert_array_equal(named.geodetic, read(path).geodetic)
+        assert named.source == str(path)
 
 
 @pytest.mark.parametrize("kind", sorted(READERS))
