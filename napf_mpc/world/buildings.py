@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from napf_mpc.data_file import readable_file
 from napf_mpc.errors import DataError
 from napf_mpc.world.shapes import Prism
 
@@ -104,17 +106,13 @@ def _rings(polygon: shapely.Polygon) -> tuple[Array, ...]:
 
 def read_json(path: Path) -> Any:
     """Parse a file of at most `MAX_FILE_BYTES`; whatever is wrong with it is a DataError."""
+    readable_file(path, MAX_FILE_BYTES)
     try:
-        size = path.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise DataError(f"{path}: {size} bytes, at most {MAX_FILE_BYTES} are read; cut the area out")
         return json.loads(path.read_bytes(), parse_constant=_refuse_constant)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
     except RecursionError as error:
         raise DataError(f"{path}: is nested too deeply") from error
-    except DataError:
-        raise
     except ValueError as error:
         raise DataError(f"{path}: is not JSON: {error}") from error
 
@@ -135,6 +133,18 @@ def point_array(where: str, values: Any, columns: tuple[int, ...]) -> Array:
     if not np.isfinite(array).all():
         raise DataError(f"{where} has a number that is not finite")
     return array.astype(np.float64)
+
+
+def check_origin(path: Path, name: str, origin: Any, axes: tuple[str, ...]) -> None:
+    """Refuse an origin that is not one finite number an axis."""
+    try:
+        values = np.array(origin, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.array(math.nan)
+    if values.shape != (len(axes),) or not np.isfinite(values).all():
+        raise DataError(
+            f"{path}: {name} = {shown(origin)}, must be {len(axes)} finite numbers: {', '.join(axes)}"
+        )
 
 
 def shown(value: Any) -> str:

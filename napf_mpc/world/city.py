@@ -21,7 +21,16 @@ import shapely
 from napf_mpc.data_folder import find_data_file
 from napf_mpc.errors import DataError
 from napf_mpc.problem import City
-from napf_mpc.world.buildings import Array, Block, Buildings, cut_into_prisms, point_array, read_json, shown
+from napf_mpc.world.buildings import (
+    Array,
+    Block,
+    Buildings,
+    check_origin,
+    cut_into_prisms,
+    point_array,
+    read_json,
+    shown,
+)
 from napf_mpc.world.cityjson import read_cityjson
 from napf_mpc.world.obstacles import ObstacleSet
 
@@ -91,7 +100,7 @@ def _load_cached(world: City, path: Path, _changed_ns: int, _size: int) -> Obsta
 
 
 def read_geojson(
-    path: Path,
+    path: Path | str,
     *,
     origin_deg: tuple[float, float] | None = None,
     height_property: str = "height_m",
@@ -106,7 +115,7 @@ def read_geojson(
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         The file, a FeatureCollection.
     origin_deg : (latitude, longitude), optional
         Origin of the local frame; by default the middle of all buildings of the file.
@@ -125,8 +134,9 @@ def read_geojson(
     Raises
     ------
     DataError
-        If the file, a feature, a coordinate or a height is not usable, or no building is left.
+        If the file, a feature, a coordinate, a height or the origin is not usable, or no building is left.
     """
+    path = Path(path)
     document = read_json(path)
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         raise DataError(f'{path}: not a GeoJSON FeatureCollection ("type" must be "FeatureCollection")')
@@ -142,7 +152,9 @@ def read_geojson(
         _feature_polygons(f"{path}: {name}", feature) for name, feature in zip(names, features, strict=True)
     ]
     flat = np.concatenate([ring for rings in chain.from_iterable(polygons) for ring in rings])
-    if origin_deg is None:
+    if origin_deg is not None:
+        check_origin(path, "origin_deg", origin_deg, ("latitude", "longitude"))
+    else:
         middle = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
         origin_deg = (float(middle[1]), float(middle[0]))
     east, north, up = pymap3d.geodetic2enu(flat[:, 1], flat[:, 0], 0.0, *origin_deg, 0.0)

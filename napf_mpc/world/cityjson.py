@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,20 @@ from napf_mpc.world.buildings import (
     Array,
     Block,
     Buildings,
+    check_origin,
     cut_into_prisms,
     point_array,
     polygons_of,
     read_json,
     shown,
 )
+from napf_mpc.world.foot_systems import FOOT_SYSTEMS
 
 _BUILDINGS = ("Building", "BuildingPart")
 _GEOGRAPHIC = ("4326", "4979", "CRS84")
+# EPSG/0/7415, EPSG::7415, EPSG:28992+5709: perhaps a version, then a code or some.
+_EPSG_CODES = re.compile(r"EPSG[:/](?:[^:/+]*[:/])?(\d{1,9}(?:\+\d{1,9})*)", re.IGNORECASE)
+_FEET = re.compile(r"\b(?:ft|ftUS|foot|feet)\b", re.IGNORECASE)
 # How many lists lie around a surface (a list of rings) in a geometry's boundaries.
 _SURFACE_DEPTH = {
     "MultiSurface": 1,
@@ -36,7 +42,7 @@ _SURFACE_DEPTH = {
 
 
 def read_cityjson(
-    path: Path,
+    path: Path | str,
     *,
     origin_m: tuple[float, float, float] | None = None,
     min_height_m: float = 0.0,
@@ -45,14 +51,17 @@ def read_cityjson(
     """Read the buildings of a CityJSON file (1.0 to 2.0) as blocks.
 
     Only objects of type Building and BuildingPart are read. The file's coordinates are **assumed to be
-    projected and metric**, as in EPSG:7415; geographic ones are refused. Of an object's geometries the one of
+    projected and metric**, as in EPSG:7415, since such a file does not say its unit but by the name of its
+    system. Refused are the commonest geographic systems (EPSG:4326 and 4979, CRS84) and all of EPSG that are
+    in feet. Other geographic systems, other units (yards, chains), systems of other registers (such as ESRI)
+    and files that name none are **not** known, and read as metres. Of an object's geometries the one of
     LoD1 is taken if there is one, else the lowest above LoD0. Its footprint is the union of its faces seen
     from above, its base the lowest and its top the highest of its vertices, so that the block holds the
     building whatever its roof is.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         The file.
     origin_m : (x, y, z), optional
         Origin of the local frame in the file's coordinates; by default the middle of all buildings of the
@@ -70,8 +79,10 @@ def read_cityjson(
     Raises
     ------
     DataError
-        If the file, an object or a vertex is not usable, or no building is left.
+        If the file, its reference system, an object, a vertex or the origin is not usable, or no building is
+        left.
     """
+    path = Path(path)
     document = read_json(path)
     if not isinstance(document, dict) or document.get("type") != "CityJSON":
         raise DataError(f'{path}: not a CityJSON file ("type" must be "CityJSON")')
@@ -94,7 +105,9 @@ def read_cityjson(
             solids.append((name, surfaces, vertices[indices]))
     if not solids:
         raise DataError(f"{path}: holds no object of type Building or BuildingPart with a geometry")
-    if origin_m is None:
+    if origin_m is not None:
+        check_origin(path, "origin_m", origin_m, ("x", "y", "z"))
+    else:
         lower = np.min([corners.min(axis=0) for _, _, corners in solids], axis=0)
         upper = np.max([corners.max(axis=0) for _, _, corners in solids], axis=0)
         x, y, _ = (0.5 * (lower + upper)).tolist()
@@ -115,8 +128,15 @@ def read_cityjson(
 def _check_metric(path: Path, document: dict[str, Any]) -> None:
     metadata = document.get("metadata", {})
     system = metadata.get("referenceSystem") if isinstance(metadata, dict) else None
-    if isinstance(system, str) and system.replace(":", "/").split("/")[-1] in _GEOGRAPHIC:
+    if not isinstance(system, str):
+        return
+    if system.replace(":", "/").split("/")[-1] in _GEOGRAPHIC:
         raise DataError(f"{path}: referenceSystem {shown(system)} is geographic; coordinates must be metric")
+    codes = {int(code) for found in _EPSG_CODES.findall(system) for code in found.split("+")}
+    if codes & FOOT_SYSTEMS or _FEET.search(system):
+        raise DataError(
+            f"{path}: referenceSystem {shown(system)} is in feet; coordinates must be metric: convert it"
+        )
 
 
 def _cityjson_vertices(path: Path, document: dict[str, Any]) -> Array:

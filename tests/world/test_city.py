@@ -1,4 +1,5 @@
 import copy
+import gzip
 import json
 import math
 import random
@@ -329,6 +330,46 @@ def test_faults_of_a_cityjson_file_are_named(tmp_path, change, named):
         read_cityjson(write(tmp_path, town, "town.json"))
 
 
+@pytest.mark.parametrize(
+    "system",
+    [
+        "https://www.opengis.net/def/crs/EPSG/0/2263",  # New York Long Island (ftUS)
+        "urn:ogc:def:crs:EPSG::2222",  # Arizona East (ft)
+        "urn:ogc:def:crs:EPSG:9.8:6539",  # New York Long Island (ftUS) of 2011
+        "EPSG:26918+6360",  # UTM in metres, heights in feet
+        "urn:ogc:def:crs,crs:EPSG::2263,crs:EPSG::5703",  # the other way round
+        "https://www.opengis.net/def/crs-compound?1=https://www.opengis.net/def/crs/EPSG/0/2263"
+        "&2=https://www.opengis.net/def/crs/EPSG/0/6360",
+        "NAD83 / New York Long Island (ftUS)",
+    ],
+)
+def test_a_cityjson_file_in_feet_is_refused(tmp_path, system):
+    """Taken as metres, its buildings would be three times as wide and as high."""
+    town = cube_town()
+    town["metadata"] = {"referenceSystem": system}
+    with pytest.raises(DataError, match=r"town\.json: referenceSystem .* is in feet; .* metric: convert"):
+        read_cityjson(write(tmp_path, town, "town.json"))
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        "https://www.opengis.net/def/crs/EPSG/0/7415",
+        "urn:ogc:def:crs:EPSG::28992",
+        "EPSG:26918+5703",
+        "https://www.opengis.net/def/crs/EPSG/2263/7415",  # a version is no code
+        "https://example.org/crs/2263",  # of another register
+        "EPSG:" + "9" * 5000,
+        "",
+        None,
+    ],
+)
+def test_a_cityjson_file_in_metres_or_of_unknown_unit_is_read(tmp_path, system):
+    town = cube_town()
+    town["metadata"] = {"referenceSystem": system}
+    assert len(read_cityjson(write(tmp_path, town, "town.json")).prisms) == 2
+
+
 # ------------------------------------------------------------------------------------------ both files
 
 
@@ -349,10 +390,37 @@ def test_text_that_is_no_city_is_a_data_error(tmp_path, read, make):
     (tmp_path / "town.geojson").write_bytes(b"\xff\xfe\x00{}")
     with pytest.raises(DataError, match="is not JSON"):
         read(tmp_path / "town.geojson")
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match=r"missing\.json: cannot be read: no such file"):
         read(tmp_path / "missing.json")
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="cannot be read: is a folder; name a file in it"):
         read(tmp_path)
+    (tmp_path / "town.json.gz").write_bytes(gzip.compress(whole.encode()))
+    with pytest.raises(DataError, match=r"town\.json\.gz: is packed by gzip; unpack it first"):
+        read(tmp_path / "town.json.gz")
+
+
+@READERS
+def test_a_byte_order_mark_and_a_name_as_text_are_read(tmp_path, read, make):
+    path = tmp_path / "town.json"
+    path.write_bytes(b"\xef\xbb\xbf" + json.dumps(make()).encode())
+    assert read(str(path)).names == read(write(tmp_path, make())).names
+
+
+@pytest.mark.parametrize(
+    ("read", "make", "name", "words"),
+    [
+        (read_cityjson, cube_town, "origin_m", "3 finite numbers: x, y, z"),
+        (read_geojson, small_town, "origin_deg", "2 finite numbers: latitude, longitude"),
+    ],
+)
+def test_an_origin_is_so_many_numbers(tmp_path, read, make, name, words):
+    path = write(tmp_path, make(), "town.json")
+    for origin in ((0.0,), (0.0, 0.0, 0.0, 0.0), (0.0, math.nan), (0.0, 0.0, math.nan), ("a", "b", "c"), 0.0):
+        with pytest.raises(DataError, match=rf"town\.json: {name} = .*, must be {words}"):
+            read(path, **{name: origin})
+    other = (0.0, 0.0) if name == "origin_m" else (0.0, 0.0, 0.0)
+    with pytest.raises(DataError, match=rf"{name} = .*, must be {words}"):
+        read(path, **{name: other})
 
 
 def leaves(node, path=()):
