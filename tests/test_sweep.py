@@ -9,11 +9,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import sensitivity
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from napf_mpc import store, sweep
 from napf_mpc.campaign import run_campaign
 from napf_mpc.cli import run_command
 from napf_mpc.errors import OutputError, ProblemError
+from napf_mpc.planners.registry import PLANNERS
 from napf_mpc.plot.style import house_style
 from napf_mpc.plot.sweep import sweep_figure
 from napf_mpc.problem_file import load_problem
@@ -238,6 +240,31 @@ def test_the_figure_has_a_panel_for_each_combination(
         assert low < 0.0
         assert high >= 0.48
     plt.close(figure)
+
+
+@pytest.mark.parametrize("vary", [["planner.k=0,1,2,3"], ["world.count=4,8", "planner.k=0,1"]])
+@pytest.mark.parametrize("planners", [["apf"], ["apf", "napf", "napf_guided"], list(PLANNERS)])
+def test_legend_and_note_of_the_figure_keep_clear_of_each_other(vary: list[str], planners: list[str]) -> None:
+    grid = points(vary)
+    keys, each = list(grid[0].settings), len(planners)
+    risk = np.linspace(0.02, 0.4, each * len(grid))
+    columns = {key: np.repeat([point.settings[key] for point in grid], each) for key in keys} | {
+        "planner": np.tile(planners, len(grid)), "runs": np.full(len(risk), 10_000_000),
+        "collision_risk": risk, "collision_risk_low": 0.8 * risk, "collision_risk_high": 1.2 * risk,
+    }  # fmt: skip
+    with house_style():
+        figure = sweep_figure(columns, keys)
+        renderer: Any = FigureCanvasAgg(figure).get_renderer()
+        figure.draw(renderer)
+        (legend,), (note,) = figure.legends, figure.texts
+        boxes = [legend.get_window_extent(renderer), note.get_window_extent(renderer)]
+    frames = [axes.get_tightbbox(renderer) for axes in figure.axes]
+    assert not boxes[0].overlaps(boxes[1])
+    assert not any(box.overlaps(frame) for box in boxes for frame in frames)
+    for box in boxes:
+        assert box.x0 >= 0.0
+        assert box.x1 <= figure.bbox.x1
+        assert box.y1 <= figure.bbox.y1
 
 
 def test_the_sensitivity_table_of_the_documents_is_a_sweep(

@@ -223,7 +223,7 @@ class _Film:
             for entry in np.flatnonzero(self._acting.sample == sample).tolist():
                 uav, shape = int(self._acting.uav[entry]), self._shapes[int(self._acting.obstacle[entry])]
                 height, margin = float(flown.estimate[sample, uav, 2]), float(self._acting.margin_m[entry])
-                artist = scene.draw_inflated(self._plan, shape, margin, height, uav_colour(uav))
+                artist = scene.draw_inflated(self._plan, shape, margin, height, uav_colour(uav, flown.uavs))
                 self._plan.draw_artist(artist)
                 artist.remove()
         if self._moving is not None:
@@ -231,7 +231,7 @@ class _Film:
             for place, radius in zip(places, self._moving.radius.tolist(), strict=True):
                 _once(self._plan, Circle((place[0], place[1]), radius, **scene.MOVING_STYLE))
         for uav in range(flown.uavs):
-            colour = uav_colour(uav)
+            colour = uav_colour(uav, flown.uavs)
             if self._small:
                 self._draw_estimate(flown.estimate[sample, uav], flown.sigma[sample, uav], colour)
             tail = flown.position[since : sample + 1, uav]

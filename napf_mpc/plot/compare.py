@@ -15,15 +15,23 @@ from numpy.typing import NDArray
 from napf_mpc.plot.style import (
     BLACK,
     COLUMN_IN,
+    EDGE_IN,
+    GREY,
     Page,
+    entry_width_in,
     house_style,
+    legend_height_in,
     planner_colour,
     planner_name,
     save,
+    text_width_in,
 )
 from napf_mpc.plot.trade import round_up, trade_figure
 from napf_mpc.problem import Reference
 from napf_mpc.risk import Rate, wilson
+
+LEAST_FRAME_IN = 1.4
+"""Width of the risks' frame where labels are long [in]; the figure grows."""
 
 
 def compare_figures(
@@ -87,10 +95,12 @@ def risk_figure(summary: Mapping[str, Any], reference: Reference | None = None, 
             paper = theirs[name]
             label = f"{planner_name(name)}, published, N = {paper.total}"
             lines.append((name, label, paper.value, paper.low, paper.high, False))
-    row, bottom, top, left = 0.25, 0.42, 0.08, 1.78 if theirs else 1.15
+    row, bottom, top, right, pad_pt = 0.25, 0.42, 0.08, 0.18, 7.0
+    left = EDGE_IN + max(text_width_in(line[1]) for line in lines) + pad_pt / 72.0
+    wide = max(COLUMN_IN, left + LEAST_FRAME_IN + right)
     notes = [credit] if reference is None else [f"Published: {reference.source}.", reference.note, credit]
-    page = Page.of_size(COLUMN_IN, bottom + row * len(lines) + top, " ".join(note for note in notes if note))
-    axes = page.axes(left, bottom, COLUMN_IN - left - 0.18, row * len(lines))
+    page = Page.of_size(wide, bottom + row * len(lines) + top, " ".join(note for note in notes if note))
+    axes = page.axes(left, bottom, wide - left - right, row * len(lines))
     for place, (name, _, value, low, high, ours) in enumerate(lines):
         height = len(lines) - 1 - place
         axes.errorbar(
@@ -110,7 +120,7 @@ def risk_figure(summary: Mapping[str, Any], reference: Reference | None = None, 
     axes.set(ylim=(-0.6, len(lines) - 0.4), xlim=(0.0, round_up(max(line[4] for line in lines))))
     axes.set_xlabel("Collision risk (%), 95 % interval")
     axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
-    axes.tick_params(axis="y", length=0.0, pad=7.0)
+    axes.tick_params(axis="y", length=0.0, pad=pad_pt)
     axes.spines["left"].set_visible(False)
     axes.grid(axis="x", color="#E4E4E4", linewidth=0.5)
     axes.set_axisbelow(True)
@@ -122,8 +132,13 @@ def clearance_figure(
 ) -> Figure:
     """Distribution of the least clearance of a run from an obstacle; the collisions lie left of zero."""
     planners: Sequence[str] = list(summary["planners"])
-    page = Page.of_size(COLUMN_IN, 2.5, credit)
-    axes = page.axes(0.5, 0.42, COLUMN_IN - 0.5 - 0.12, 1.8)
+    counts = {name: int(summary["planners"][name]["runs"]) for name in planners}
+    labels = [f"{planner_name(name)}, N = {counts[name]}" for name in planners]
+    bottom, tall = 0.42, 1.8
+    wide = max(COLUMN_IN, 2.0 * EDGE_IN + max(entry_width_in(words) for words in labels))
+    height = bottom + tall + 0.1 + legend_height_in(labels, wide - 2.0 * EDGE_IN)
+    page = Page.of_size(wide, height, credit)
+    axes = page.axes(0.5, bottom, wide - 0.5 - 0.12, tall)
     lowest, highest = -0.5, 0.5
     for name in planners:
         values = np.asarray(rows["min_clearance_m"], dtype=float)[rows["planner"] == name]
@@ -134,25 +149,22 @@ def clearance_figure(
         # The steps go on to both sides, beyond every edge.
         x = np.concatenate([[x[1] - 1e3], x[1:], [x[-1] + 1e3]])
         axes.plot(x, [*y, 1.0], drawstyle="steps-post", color=planner_colour(name), linewidth=1.2)
-    axes.axvline(0.0, color=BLACK, linewidth=0.8, linestyle=(0, (4, 2)), zorder=2)
-    axes.annotate("contact", (0.0, 1.0), xycoords=("data", "axes fraction"), xytext=(-3, 1),
-                  textcoords="offset points", ha="right", va="top", rotation=90)  # fmt: skip
-    axes.set(xlim=(1.05 * lowest, 1.02 * highest), ylim=(0.0, 1.0))
+    if np.isfinite(np.asarray(rows["min_clearance_m"], dtype=float)).any():
+        axes.axvline(0.0, color=BLACK, linewidth=0.8, linestyle=(0, (4, 2)), zorder=2)
+        axes.annotate("contact", (0.0, 1.0), xycoords=("data", "axes fraction"), xytext=(-3, 1),
+                      textcoords="offset points", ha="right", va="top", rotation=90)  # fmt: skip
+    else:
+        axes.text(0.5, 0.5, "no obstacles", transform=axes.transAxes, ha="center", color=GREY)
+    # Wide enough on the left for the word beside the line.
+    axes.set(xlim=(min(1.05 * lowest, -0.08 * highest), 1.02 * highest), ylim=(0.0, 1.0))
     axes.set_xlabel("Least clearance of a run (m)")
     axes.set_ylabel("Runs with less (%)")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=""))
-    counts = {name: int(summary["planners"][name]["runs"]) for name in planners}
     handles = [
-        Line2D(
-            [],
-            [],
-            color=planner_colour(name),
-            linewidth=1.2,
-            label=f"{planner_name(name)}, N = {counts[name]}",
-        )
-        for name in planners
+        Line2D([], [], color=planner_colour(name), linewidth=1.2, label=words)
+        for name, words in zip(planners, labels, strict=True)
     ]
-    page.legend(handles, 2.46)
+    page.legend(handles, height - 0.04)
     return page.figure
 
 

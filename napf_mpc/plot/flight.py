@@ -16,7 +16,14 @@ from napf_mpc.closed_loop import formation_mission
 from napf_mpc.formation import PathFrame
 from napf_mpc.plot import scene
 from napf_mpc.plot.space import space_figure
-from napf_mpc.plot.states import attitude_figure, distance_figure, motion_figure
+from napf_mpc.plot.states import (
+    BAR_HEIGHT_IN,
+    MAX_LEGEND,
+    attitude_figure,
+    distance_figure,
+    draw_uav_bar,
+    motion_figure,
+)
 from napf_mpc.plot.style import (
     BLACK,
     GREY,
@@ -26,6 +33,7 @@ from napf_mpc.plot.style import (
     house_style,
     planner_name,
     save,
+    text_width_in,
     uav_colour,
 )
 from napf_mpc.plot.tracks import (
@@ -46,8 +54,6 @@ from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
 
-LABELLED = 8
-"""Formations up to this size get a label at every path."""
 SHOWN_APART = 4
 """UAVs that get a panel of their own: those that came closest to an obstacle."""
 ELLIPSE_EVERY_S = 8.0
@@ -155,7 +161,7 @@ def paths_figure(
     """
     frame = PathFrame.of_mission(formation_mission(problem))
     level = abs(frame.heading_rad) < 1e-9
-    few = flown.uavs <= LABELLED
+    few = flown.uavs <= MAX_LEGEND
     seen = np.concatenate([each.position.reshape(-1, 3) for each in (flown, *beside)])
     view = scene.view_of(seen, obstacles, pad_m=2.0, reach_m=12.0)
     label_m = 0.075 * max(view.width, view.height) if few else 0.0
@@ -163,7 +169,7 @@ def paths_figure(
     view = scene.View((view.x[0] - label_m * westward, view.x[1] + label_m * (not westward)), view.y)
     along = frame.along_track(seen)
     span = view.x if level else (float(along.min()) - 2.0, float(along.max()) + 2.0)
-    left, right, bottom, gap, top = 0.58, 0.08, 0.4, 0.32, 0.28
+    left, right, bottom, gap, top = 0.58, 0.08, 0.4, 0.32, 0.28 if few else 0.28 + BAR_HEIGHT_IN
     wide = PAGE_IN - left - right
     scale = min(wide / view.width, 5.2 / view.height)
     plan_w, plan_h = scale * view.width, scale * view.height
@@ -194,7 +200,8 @@ def paths_figure(
     mark_contacts(plan, [(each.position[0], each.position[1]) for each in found])
     across = [each.position[0] if level else float(frame.along_track(each.position)) for each in found]
     mark_contacts(side, [(place, each.position[2]) for place, each in zip(across, found, strict=True)])
-    page.text(left, height - 0.02, flight_title(problem, flown), va="top")
+    title = flight_title(problem, flown)
+    page.text(left, height - 0.02, title, va="top")
     handles: list[Any] = [scene.start_mark(), scene.end_mark()]
     if len(obstacles):
         handles.append(scene.obstacle_mark(obstacles))
@@ -202,7 +209,10 @@ def paths_figure(
         handles.append(scene.moving_mark())
     if found:
         handles.append(scene.contact_mark())
-    page.legend(handles, height - 0.02, x=left + 1.9)
+    marks = left + max(1.9, text_width_in(title) + 0.2)
+    page.legend(handles, height - 0.02, x=marks)
+    if not few:
+        draw_uav_bar(page, flown.uavs, height - 0.2, x=marks)
     return page.figure
 
 
@@ -224,8 +234,9 @@ def draw_paths(axes: Axes, x: Array, y: Array, label: bool) -> None:
     """Draw the path of every UAV, (time, uav), with start and end, and on request a label beside each end."""
     uavs = x.shape[1]
     for uav in range(uavs):
-        colour = uav_colour(uav)
-        axes.plot(x[:, uav], y[:, uav], color=colour, linewidth=1.1 if uavs <= LABELLED else 0.5, zorder=4)
+        colour = uav_colour(uav, uavs)
+        thick = 1.1 if uavs <= MAX_LEGEND else 0.8
+        axes.plot(x[:, uav], y[:, uav], color=colour, linewidth=thick, zorder=4)
         axes.plot(x[0, uav], y[0, uav], "o", markersize=3.5, mfc="white", mec=colour, mew=0.9, zorder=5)
         axes.plot(x[-1, uav], y[-1, uav], "s", markersize=3.2, color=colour, zorder=5)
     if not label:
@@ -235,7 +246,7 @@ def draw_paths(axes: Axes, x: Array, y: Array, label: bool) -> None:
     place = float(x[-1].min()) - 0.09 * inch if westward else float(x[-1].max()) + 0.09 * inch
     for uav, height in enumerate(spread(y[-1], 0.135 * inch).tolist()):
         side = "right" if westward else "left"
-        words = axes.text(place, height, f"UAV {uav + 1}", color=uav_colour(uav), va="center", ha=side)
+        words = axes.text(place, height, f"UAV {uav + 1}", color=uav_colour(uav, uavs), va="center", ha=side)
         words.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.75})
 
 
@@ -293,11 +304,11 @@ def uncertainty_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -
     view = scene.view_of(np.concatenate(points), obstacles, pad_m=1.0, reach_m=2.0)
     columns = 1 if len(shown) == 1 else 2
     rows = -(-len(shown) // columns)
-    left, right, gap, bottom, top, title = 0.58, 0.08, 0.14, 0.4, 0.24, 0.2
+    left, right, gap, bottom, top, over = 0.58, 0.08, 0.14, 0.4, 0.24, 0.2
     wide = (PAGE_IN - left - right - gap * (columns - 1)) / columns
     scale = min(wide / view.width, 3.2 / view.height)
     wide, tall = scale * view.width, scale * view.height
-    height = bottom + rows * (tall + title) + top
+    height = bottom + rows * (tall + over) + top
     page = Page.of_size(PAGE_IN, height, credit_of(problem))
     # Recorded are the reported sigmas: they do not tell other margins.
     inflates = inflation.k > 0.0 and inflation.mode == "shift" and inflation.safety == "k_sigma"
@@ -306,9 +317,10 @@ def uncertainty_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -
     shapes = obstacles.shapes() if inflates else []
     for place, uav in enumerate(shown):
         row, column = divmod(place, columns)
-        axes = page.axes(left + column * (wide + gap), bottom + (rows - 1 - row) * (tall + title), wide, tall)
+        axes = page.axes(left + column * (wide + gap), bottom + (rows - 1 - row) * (tall + over), wide, tall)
         axes.set(xlim=view.x, ylim=view.y)
-        axes.set_title(f"UAV {uav + 1}", color=uav_colour(uav), pad=2.0)
+        colour = uav_colour(uav, flown.uavs)
+        axes.set_title(f"UAV {uav + 1}", color=colour, pad=2.0)
         last_in_column = place + columns >= len(shown)
         axes.set_xlabel("East x (m)" if last_in_column else "")
         axes.set_ylabel("North y (m)" if column == 0 else "")
@@ -319,10 +331,11 @@ def uncertainty_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -
                 flight_height = float(flown.estimate[seen.sample[entry], uav, 2])
                 shape, margin = shapes[int(seen.obstacle[entry])], float(seen.margin_m[entry])
                 scene.draw_inflated(axes, shape, margin, flight_height)
-        scene.draw_ellipses(axes, flown.estimate[picks, uav], flown.sigma[picks, uav], k, uav_colour(uav))
-        axes.plot(*flown.estimate[:, uav, :2].T, color=uav_colour(uav), linewidth=0.5, zorder=3)
+        scene.draw_ellipses(axes, flown.estimate[picks, uav], flown.sigma[picks, uav], k, colour)
+        axes.plot(*flown.estimate[:, uav, :2].T, color=colour, linewidth=0.5, zorder=3)
         axes.plot(*flown.position[:, uav, :2].T, color=BLACK, linewidth=1.2, zorder=4)
-    page.text(left, height - 0.02, flight_title(problem, flown), va="top")
+    title = flight_title(problem, flown)
+    page.text(left, height - 0.02, title, va="top")
     handles: list[Any] = [
         Line2D([], [], color=BLACK, linewidth=1.2, label="true path"),
         Line2D([], [], color=GREY, linewidth=0.5, label="estimate"),
@@ -331,7 +344,7 @@ def uncertainty_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -
     ]  # fmt: skip
     if inflates:
         handles.append(scene.inflated_mark(k))
-    page.legend(handles, height - 0.02, x=left + 1.1)
+    page.legend(handles, height - 0.02, x=left + max(1.1, text_width_in(title) + 0.2))
     return page.figure
 
 

@@ -14,8 +14,17 @@ from numpy.typing import NDArray
 
 from napf_mpc.plot import scene
 from napf_mpc.plot.flight import draw_moving, draw_paths, mark_contacts
-from napf_mpc.plot.states import uav_handles
-from napf_mpc.plot.style import PAGE_IN, Page, credit_of, house_style, planner_name, save
+from napf_mpc.plot.states import BAR_HEIGHT_IN, MAX_LEGEND, draw_uav_bar, uav_handles
+from napf_mpc.plot.style import (
+    EDGE_IN,
+    PAGE_IN,
+    Page,
+    credit_of,
+    house_style,
+    legend_height_in,
+    planner_name,
+    save,
+)
 from napf_mpc.plot.tracks import contacts, track
 from napf_mpc.problem import Problem
 from napf_mpc.world.moving import MovingObstacles
@@ -136,14 +145,23 @@ def overview_figure(
     view = scene.view_of(points, scenes[missions[0].run], pad_m=max(2.0, 0.03 * long), reach_m=0.08 * long)
     columns = min(len(missions), 2 if view.width > 1.2 * view.height else 3 if len(missions) % 3 == 0 else 2)
     rows = -(-len(missions) // columns)
-    left, right, gap, bottom, title, top = 0.58, 0.1, 0.14, 0.4, 0.2, 0.24
+    left, right, gap, bottom, title = 0.58, 0.1, 0.14, 0.4, 0.2
     wide = (PAGE_IN - left - right - gap * (columns - 1)) / columns
     tall = wide * view.height / view.width
+    found = [
+        contacts(flown, scenes[mission.run], problem.vehicle.radius_m, moving_of_run(mission.run))
+        for mission, flown in zip(missions, flights, strict=True)
+    ]
+    uavs = flights[0].uavs
+    handles: list[Any] = [*uav_handles(uavs), scene.start_mark(), scene.end_mark()]
+    handles += [scene.moving_mark()] * bool(problem.world.moving)
+    handles += [scene.contact_mark()] * any(found)
+    marks_in = legend_height_in([str(handle.get_label()) for handle in handles], PAGE_IN - 2.0 * EDGE_IN)
+    top = 0.06 + marks_in + BAR_HEIGHT_IN * (uavs > MAX_LEGEND)
     shaded = any(scene.shades_heights(obstacles) for obstacles in scenes.values())
     height = bottom + rows * (tall + title) + top + 0.5 * shaded
     page = Page.of_size(PAGE_IN, height, credit_of(problem))
     base = height - top - rows * (tall + title)
-    found_any = False
     for place, (mission, flown) in enumerate(zip(missions, flights, strict=True)):
         row, column = divmod(place, columns)
         axes = page.axes(left + column * (wide + gap), base + (rows - 1 - row) * (tall + title), wide, tall)
@@ -157,9 +175,7 @@ def overview_figure(
         if moving is not None:
             draw_moving(axes, flown, moving)
         draw_paths(axes, flown.position[..., 0], flown.position[..., 1], label=False)
-        found = contacts(flown, scenes[mission.run], problem.vehicle.radius_m, moving)
-        mark_contacts(axes, [(contact.position[0], contact.position[1]) for contact in found])
-        found_any |= bool(found)
+        mark_contacts(axes, [(contact.position[0], contact.position[1]) for contact in found[place]])
         words = f": {mission.words}" if mission.words else ""
         axes.set_title(
             f"({chr(97 + place)}) {planner_name(mission.planner)}, run {mission.run}{words}", pad=3.0
@@ -173,7 +189,7 @@ def overview_figure(
         )
         bar.ax.tick_params(length=2.0)
         bar.set_label("Height of roofs (m)")
-    handles: list[Any] = [*uav_handles(flights[0].uavs), scene.start_mark(), scene.end_mark()]
-    handles += [scene.moving_mark()] * bool(problem.world.moving)
-    page.legend(handles + [scene.contact_mark()] * found_any, height - 0.02)
+    page.legend(handles, height - 0.02)
+    if uavs > MAX_LEGEND:
+        draw_uav_bar(page, uavs, height - 0.02 - marks_in)
     return page.figure

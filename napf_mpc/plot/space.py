@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from napf_mpc.plot import scene
-from napf_mpc.plot.states import uav_handles
+from napf_mpc.plot.states import beside, name_uavs
 from napf_mpc.plot.style import GREY, PAGE_IN, PALE, Page, credit_of, plain_panes, planner_name, uav_colour
 from napf_mpc.plot.tracks import Track
 from napf_mpc.problem import Problem
@@ -55,7 +55,7 @@ def space_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figu
     for shape in shown:
         _draw_solid(axes, shape, low, high)
     for uav in range(flown.uavs):
-        colour = uav_colour(uav)
+        colour = uav_colour(uav, flown.uavs)
         x, y, z = flown.position[:, uav].T
         axes.plot(x, y, z, color=colour, linewidth=1.1, zorder=5)
         axes.plot(x, y, np.full_like(z, low), color=colour, linewidth=0.4, alpha=0.6, zorder=0.5)
@@ -73,7 +73,7 @@ def space_figure(problem: Problem, flown: Track, obstacles: ObstacleSet) -> Figu
     axes.tick_params(pad=-1.0)
     plain_panes(axes)
     page.text(0.1, height - 0.02, planner_name(flown.planner), va="top")
-    page.legend(uav_handles(flown.uavs), height - 0.02)
+    name_uavs(page, flown.uavs, height - 0.02, beside(0.1, planner_name(flown.planner)))
     return page.figure
 
 

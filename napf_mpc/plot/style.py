@@ -10,9 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.style
+import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.text import Text
+from matplotlib.textpath import text_to_path
 
 from napf_mpc.problem import Problem
 from napf_mpc.store import output_folder, write_bytes
@@ -27,12 +32,18 @@ FONT_PT = 8.0
 """Size of all text but the credit line [pt]."""
 CREDIT_PT = 7.0
 """Size of the credit line [pt]."""
+EDGE_IN = 0.06
+"""Least space between words and the edge of a page [in]."""
+LEGEND_ROW_IN = 0.18
+"""Height of a row of a legend [in]."""
 
 # Okabe and Ito's palette, told apart with any common colour vision; their yellow is too pale for lines.
 BLUE, VERMILION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 UAV_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
-"""Colour of UAV 1, 2, ...; repeated for larger formations."""
+"""Colour of UAV 1, 2, ... in formations that are no larger than this."""
+UAV_MAP, UAV_MAP_END = "plasma", 0.88
+"""Colours of the UAVs of larger formations, but for those too pale for lines."""
 PLANNER_COLOURS = {
     "apf": VERMILION,
     "napf": BLUE,
@@ -47,6 +58,8 @@ PLANNER_NAMES = {
     "qp": "QP",
     "qp_unguided": "QP unguided",
 }
+HANDLE_PAD = 0.5
+"""Space between line and words of a legend's entry, in sizes of the text."""
 GREY, PALE, RULE = "#6E6E6E", "#C8C8C8", "#3C3C3C"
 """Notes, fills and thin rules."""
 
@@ -87,9 +100,11 @@ def house_style() -> Iterator[None]:
         yield
 
 
-def uav_colour(uav: int) -> str:
-    """Colour of UAV ``uav``, counted from zero."""
-    return UAV_COLOURS[uav % len(UAV_COLOURS)]
+def uav_colour(uav: int, uavs: int = len(UAV_COLOURS)) -> str:
+    """Colour of UAV ``uav``, counted from zero, in a formation of ``uavs``."""
+    if uavs <= len(UAV_COLOURS):
+        return UAV_COLOURS[uav % len(UAV_COLOURS)]
+    return to_hex(colormaps[UAV_MAP](UAV_MAP_END * uav / (uavs - 1)))
 
 
 def planner_colour(planner: str) -> str:
@@ -106,6 +121,33 @@ def credit_of(problem: Problem) -> str:
     """Source and licence of the shared data behind a problem, empty if it uses none."""
     sources = [getattr(problem.world, "credit", ""), getattr(problem.navigation, "credit", "")]
     return ". ".join(dict.fromkeys(text.rstrip(".") for text in sources if text))
+
+
+def text_width_in(words: str) -> float:
+    """Width of one line of text of the usual size, dollar signs as they are [in]."""
+    font = FontProperties(family=_RC["font.family"], size=FONT_PT)
+    return float(text_to_path.get_text_width_height_descent(words, font, False)[0]) / 72.0
+
+
+def entry_width_in(words: str) -> float:
+    """Width of a legend's entry: a line, and words beside it [in]."""
+    return text_width_in(words) + float(_RC["legend.handlelength"] + HANDLE_PAD) * FONT_PT / 72.0
+
+
+def legend_columns(labels: Sequence[str], room_in: float) -> int:
+    """Most columns of a legend, filled column by column, that stand in a room; at least one."""
+    em_in = FONT_PT / 72.0
+    widths = [entry_width_in(words) for words in labels]
+    for columns in range(len(labels), 1, -1):
+        needed = sum(max(part) for part in np.array_split(widths, columns))
+        if needed + (columns - 1) * _RC["legend.columnspacing"] * em_in <= room_in:
+            return columns
+    return 1
+
+
+def legend_height_in(labels: Sequence[str], room_in: float) -> float:
+    """Height of the rows of a legend that stands in a room of this width [in]."""
+    return LEGEND_ROW_IN * -(-len(labels) // legend_columns(labels, room_in))
 
 
 @dataclass(frozen=True)
@@ -155,18 +197,22 @@ class Page:
         return self.figure.text(x, y, words, parse_math=False, **options)
 
     def legend(self, handles: Sequence[Any], y: float, x: float | None = None, columns: int = 0) -> None:
-        """One legend for all panels, its upper edge at a height [in], outside every frame."""
+        """One legend for all panels, its upper edge at a height [in], outside every frame.
+
+        It is centred, or begins at ``x``. Without a number of columns it has as many as the page is wide.
+        """
         if not handles:
             return
         full_width = float(self.figure.get_size_inches()[0])
+        room = full_width - EDGE_IN - (EDGE_IN if x is None else x)
         place = self._fraction(full_width / 2.0 if x is None else x, y, 0.0, 0.0)
         self.figure.legend(
             handles=handles,
             loc="upper center" if x is None else "upper left",
             bbox_to_anchor=(place[0], place[1]),
-            ncol=columns or len(handles),
+            ncol=columns or legend_columns([str(handle.get_label()) for handle in handles], room),
             borderpad=0.0,
-            handletextpad=0.5,
+            handletextpad=HANDLE_PAD,
         )
 
 

@@ -16,17 +16,21 @@ from numpy.typing import NDArray
 
 from napf_mpc.plot.style import (
     COLUMN_IN,
+    EDGE_IN,
     GREY,
     PAGE_IN,
     Page,
     house_style,
+    legend_height_in,
     planner_colour,
     planner_name,
     save,
 )
 from napf_mpc.plot.trade import round_up
 
-LEFT_IN, GAP_IN, RIGHT_IN, BOTTOM_IN, TALL_IN, HEAD_IN = 0.52, 0.2, 0.12, 0.42, 1.5, 0.26
+LEFT_IN, GAP_IN, RIGHT_IN, BOTTOM_IN, TALL_IN = 0.52, 0.2, 0.12, 0.42, 1.5
+NOTE_IN = 0.2
+"""Height of the note below the legend [in]."""
 COLUMNS = 3
 MARKERS = "osD^v"
 TITLE_CHARACTERS = 34
@@ -56,7 +60,9 @@ def sweep_figure(columns: Mapping[str, NDArray[Any]], keys: Sequence[str], credi
     head = 0.12 + 0.14 * lines
     row_in = TALL_IN + head + BOTTOM_IN
     down = -(-len(panels) // COLUMNS)
-    page = Page.of_size(wide, down * row_in + HEAD_IN, credit)
+    key_in = legend_height_in([planner_name(planner) for planner in planners], wide - LEFT_IN - EDGE_IN)
+    height = down * row_in + NOTE_IN + key_in
+    page = Page.of_size(wide, height, credit)
     width = (wide - LEFT_IN - RIGHT_IN - (across - 1) * GAP_IN) / across
     highest = round_up(float(columns["collision_risk_high"].max()))
     values = list(dict.fromkeys(columns[along].tolist()))
@@ -97,16 +103,9 @@ def sweep_figure(columns: Mapping[str, NDArray[Any]], keys: Sequence[str], credi
         )
         for n, planner in enumerate(planners)
     ]  # fmt: skip
-    edge = down * row_in + HEAD_IN - 0.04
-    page.legend(drawn, edge, x=LEFT_IN)
-    page.text(
-        wide - RIGHT_IN,
-        edge,
-        f"bars: 95 % interval, N = {columns['runs'][0]}",
-        ha="right",
-        va="top",
-        color=GREY,
-    )
+    page.legend(drawn, height - 0.04, x=LEFT_IN)
+    note = f"bars: 95 % interval, N = {columns['runs'][0]}"
+    page.text(LEFT_IN, height - 0.04 - key_in, note, ha="left", va="top", color=GREY)
     return page.figure
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,18 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import PercentFormatter
 
-from napf_mpc.plot.style import GREY, PAGE_IN, Page, house_style, planner_colour, planner_name, save
+from napf_mpc.plot.style import (
+    COLUMN_IN,
+    EDGE_IN,
+    GREY,
+    PAGE_IN,
+    Page,
+    house_style,
+    legend_height_in,
+    planner_colour,
+    planner_name,
+    save,
+)
 
 METRICS = (("shape_rms_m", "Shape RMS (m)"), ("path_rms_m", "Path RMS (m)"))
 """Metrics that are set against the risk."""
@@ -23,8 +34,10 @@ FINISHED = 0.95
 """A planner of which fewer missions finish is drawn hollow: it may be safe because it stands still."""
 LEFT_IN, GAP_IN, RIGHT_IN = 0.55, 0.25, 0.1
 """Margins of the two panels on a page [in]."""
-NOTE_CHARACTERS = 112
+NOTE_CHARACTERS_AN_INCH = 17
 """In a line of the note above the panels."""
+NOTE_LINE_IN = 0.14
+"""Height of such a line [in]."""
 
 Part = Mapping[str, Any]
 """What a summary says of one planner."""
@@ -34,7 +47,8 @@ def trade_figure(summary: Mapping[str, Any], credit: str = "") -> Figure:
     """Collision risk with its 95 % interval against formation error, median and 5th to 95th percentile.
 
     A dashed line marks ``shape_floor_m``: the shape error that the navigation errors alone would cause if
-    every UAV sat on its estimate's slot. A UAV too slow to follow its estimate can stay below.
+    every UAV sat on its estimate's slot. A UAV too slow to follow its estimate can stay below. A lone UAV has
+    no shape, and no panel for it.
 
     Parameters
     ----------
@@ -44,17 +58,21 @@ def trade_figure(summary: Mapping[str, Any], credit: str = "") -> Figure:
         Source and licence of shared data, printed below.
     """
     planners: Mapping[str, Part] = summary["planners"]
-    bottom, tall, top = 0.4, 2.0, 0.56
-    page = Page.of_size(PAGE_IN, bottom + tall + top, credit)
-    for place, axes in enumerate(_panels(page, bottom, tall)):
-        metric, words = METRICS[place]
+    lone = all(part.get("uavs") == 1 for part in planners.values())
+    metrics = METRICS[1:] if lone else METRICS
+    wide = COLUMN_IN if lone else PAGE_IN
+    handles = [_planner_handle(name, marker="o") for name in planners]
+    note = _note(planners.values(), metrics, wide)
+    bottom, tall = 0.4, 2.0
+    height = bottom + tall + _key_height_in(handles, note, wide)
+    page = Page.of_size(wide, height, credit)
+    for (metric, words), axes in zip(metrics, _panels(page, bottom, tall, len(metrics)), strict=True):
         for name, part in planners.items():
             _point(axes, part, metric, planner_colour(name))
         _scale(axes, planners.values(), metric)
         _floor(axes, planners.values(), metric)
         axes.set_xlabel(words)
-    handles = [_planner_handle(name, marker="o") for name in planners]
-    _key(page, bottom + tall + top - 0.02, handles, planners.values())
+    _key(page, height - 0.02, handles, note)
     return page.figure
 
 
@@ -82,9 +100,16 @@ def fronts_figure(
     if not levels:
         raise ValueError("fronts is empty: there is nothing to draw")
     markers = {k: K_MARKERS[i % len(K_MARKERS)] for i, k in enumerate(levels)}
-    tall, title, between, bottom, top = 1.45, 0.2, 0.3, 0.42, 0.56
+    handles = [_planner_handle(name) for name in planners]
+    handles += [
+        Line2D([], [], color=GREY, linewidth=0.0, marker=markers[k], markersize=4.5, label=f"k = {k:g}")
+        for k in levels
+    ]
+    every = [part for cell in fronts.values() for front in cell.values() for part in front.values()]
+    above = _note(every, METRICS, PAGE_IN)
+    tall, title, between, bottom = 1.45, 0.2, 0.3, 0.42
     row = tall + title + between
-    height = bottom + row * len(fronts) - between + top
+    height = bottom + row * len(fronts) - between + _key_height_in(handles, above, PAGE_IN) + 0.04
     page = Page.of_size(PAGE_IN, height, " ".join(words for words in (note, credit) if words))
     for place, (cell, of_planner) in enumerate(fronts.items()):
         base = bottom + row * (len(fronts) - 1 - place)
@@ -110,13 +135,7 @@ def fronts_figure(
                 axes.set_xlabel(words)
             if side == 0:
                 axes.set_title(f"({chr(97 + place)}) {cell}", pad=5.0)
-    handles = [_planner_handle(name) for name in planners]
-    handles += [
-        Line2D([], [], color=GREY, linewidth=0.0, marker=markers[k], markersize=4.5, label=f"k = {k:g}")
-        for k in levels
-    ]
-    every = [part for cell in fronts.values() for front in cell.values() for part in front.values()]
-    _key(page, height - 0.06, handles, every)
+    _key(page, height - 0.06, handles, above)
     return page.figure
 
 
@@ -148,12 +167,14 @@ def round_up(share: float) -> float:
     return 1.0
 
 
-def _panels(page: Page, base_in: float, tall_in: float) -> list[Axes]:
-    """Two panels side by side, the risk's axis named on the left one."""
-    wide = (PAGE_IN - LEFT_IN - GAP_IN - RIGHT_IN) / 2
-    panels = [page.axes(LEFT_IN + side * (wide + GAP_IN), base_in, wide, tall_in) for side in range(2)]
+def _panels(page: Page, base_in: float, tall_in: float, count: int = 2) -> list[Axes]:
+    """Panels side by side, the risk's axis named on the left one."""
+    full = float(page.figure.get_size_inches()[0])
+    wide = (full - LEFT_IN - (count - 1) * GAP_IN - RIGHT_IN) / count
+    panels = [page.axes(LEFT_IN + side * (wide + GAP_IN), base_in, wide, tall_in) for side in range(count)]
     panels[0].set_ylabel("Collision risk (%)")
-    panels[1].tick_params(labelleft=False)
+    for axes in panels[1:]:
+        axes.tick_params(labelleft=False)
     return panels
 
 
@@ -212,14 +233,30 @@ def _planner_handle(name: str, marker: str = "") -> Line2D:
     )
 
 
-def _key(page: Page, edge_in: float, handles: list[Any], parts: Iterable[Part]) -> None:
-    """Legend, and below it what bars and hollow points mean."""
-    page.legend(handles, edge_in, x=LEFT_IN)
+def _note(parts: Iterable[Part], metrics: Sequence[tuple[str, str]], wide_in: float) -> str:
+    """What bars, the dashed line and hollow points mean, in lines that stand on a page of a width."""
     every = list(parts)
     words = ["bars: 5th to 95th percentile of runs, and 95 % interval of the risk"]
-    if any(part["shape_floor_m"]["median"] is not None for part in every):
+    if any(metric == "shape_rms_m" for metric, _ in metrics) and any(
+        part["shape_floor_m"]["median"] is not None for part in every
+    ):
         words.append("dashed: shape error from navigation errors alone")
     if not all(_finishes(part) for part in every):
         words.append(f"hollow: fewer than {100 * FINISHED:g} % of the missions finished")
-    note = "\n".join(textwrap.wrap("; ".join(words), NOTE_CHARACTERS))
-    page.text(LEFT_IN, edge_in - 0.17, note, ha="left", va="top", color=GREY, linespacing=1.15)
+    return "\n".join(textwrap.wrap("; ".join(words), int(NOTE_CHARACTERS_AN_INCH * (wide_in - LEFT_IN))))
+
+
+def _key_height_in(handles: Sequence[Line2D], note: str, wide_in: float) -> float:
+    """Height of legend and note with the space around them [in]."""
+    labels = [str(handle.get_label()) for handle in handles]
+    rows_in = legend_height_in(labels, wide_in - LEFT_IN - EDGE_IN)
+    return rows_in + NOTE_LINE_IN * (note.count("\n") + 1) + 0.1
+
+
+def _key(page: Page, edge_in: float, handles: Sequence[Line2D], note: str) -> None:
+    """Legend, and below it what bars and hollow points mean."""
+    page.legend(handles, edge_in, x=LEFT_IN)
+    labels = [str(handle.get_label()) for handle in handles]
+    wide_in = float(page.figure.get_size_inches()[0])
+    below = edge_in - legend_height_in(labels, wide_in - LEFT_IN - EDGE_IN)
+    page.text(LEFT_IN, below, note, ha="left", va="top", color=GREY, linespacing=1.15)

@@ -7,6 +7,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -716,6 +717,56 @@ def figures_of(
     }
 
 
+def check_readable(name: str, figure: Figure) -> None:
+    """All words lie inside the figure, are large enough, and keep clear of panels and of each other."""
+    renderer: Any = FigureCanvasAgg(figure).get_renderer()
+    figure.draw(renderer)
+    sides = [axis for axes in figure.axes for axis in axes._axis_map.values()]
+    # An axis in space counts ticks beyond its ends that are never drawn; its label is farther out.
+    drawn = [
+        axis.label.get_window_extent(renderer)
+        if hasattr(axis.axes, "zaxis")
+        else axis.get_tightbbox(renderer)
+        for axis in sides
+    ]
+    texts = [words for axes in figure.axes for words in (*axes.texts, axes.title) if words.get_text()]
+    drawn += [words.get_window_extent(renderer) for words in (*figure.texts, *figure.legends, *texts)]
+    box = Bbox.union([part for part in drawn if part is not None])
+    inside = (
+        box.x0 >= -1.0,
+        box.y0 >= -1.0,
+        box.x1 <= figure.bbox.x1 + 1.0,
+        box.y1 <= figure.bbox.y1 + 1.0,
+    )
+    assert all(inside), f"{name}: text is cut off (left, bottom, right, top): {inside}"
+    for axes in figure.axes:
+        for words in (axes.get_xlabel(), axes.get_ylabel()):
+            assert not words or any(unit in words for unit in ("(m", "(s)", "(°", "(%)")), f"{name}: {words}"
+        texts = [*axes.texts, axes.title, axes.xaxis.label, *axes.get_xticklabels()]
+        assert min(text.get_fontsize() for text in texts) >= FONT_PT, name
+        for legend in figure.legends:
+            if hasattr(axes, "zaxis"):
+                continue  # square axes behind the page; the box in space is smaller
+            frame, words_box = axes.get_window_extent(), legend.get_window_extent(renderer)
+            assert not frame.overlaps(words_box), f"{name}: legend over a panel"
+            assert not axes.title.get_window_extent(renderer).overlaps(words_box), (
+                f"{name}: legend on a title"
+            )
+    # Head of the page: title, note, legend, bar of colours with its numbers.
+    bars = [axes for axes in figure.axes if hasattr(axes, "_colorbar")]
+    head = [words.get_window_extent(renderer) for words in (*figure.texts, *figure.legends)]
+    head += [axes.get_tightbbox(renderer) for axes in bars]
+    for one, other in combinations(head, 2):
+        assert not one.overlaps(other), f"{name}: words of the head over each other"
+    for bar in bars:
+        numbers = [label.get_window_extent(renderer) for label in bar.get_xticklabels() if label.get_text()]
+        assert not any(one.overlaps(other) for one, other in combinations(numbers, 2)), f"{name}: numbers"
+        for axes in figure.axes:
+            if axes not in bars and not hasattr(axes, "zaxis"):
+                assert not axes.get_window_extent().overlaps(bar.get_tightbbox(renderer)), f"{name}: bar"
+                assert not axes.title.get_window_extent(renderer).overlaps(bar.get_tightbbox(renderer)), name
+
+
 def test_every_figure_can_be_read(
     problem: Problem,
     block: Block,
@@ -724,38 +775,117 @@ def test_every_figure_can_be_read(
 ) -> None:
     with house_style():
         for name, figure in figures_of(problem, block, obstacles, *campaign).items():
-            renderer: Any = FigureCanvasAgg(figure).get_renderer()
-            figure.draw(renderer)
-            sides = [axis for axes in figure.axes for axis in axes._axis_map.values()]
-            # An axis in space counts ticks beyond its ends that are never drawn; its label is farther out.
-            drawn = [
-                axis.label.get_window_extent(renderer)
-                if hasattr(axis.axes, "zaxis")
-                else axis.get_tightbbox(renderer)
-                for axis in sides
-            ]
-            texts = [words for axes in figure.axes for words in (*axes.texts, axes.title) if words.get_text()]
-            drawn += [words.get_window_extent(renderer) for words in (*figure.texts, *figure.legends, *texts)]
-            box = Bbox.union([part for part in drawn if part is not None])
-            inside = (
-                box.x0 >= -1.0,
-                box.y0 >= -1.0,
-                box.x1 <= figure.bbox.x1 + 1.0,
-                box.y1 <= figure.bbox.y1 + 1.0,
-            )
-            assert all(inside), f"{name}: text is cut off (left, bottom, right, top): {inside}"
-            for axes in figure.axes:
-                for words in (axes.get_xlabel(), axes.get_ylabel()):
-                    assert not words or any(unit in words for unit in ("(m", "(s)", "(°", "(%)")), (
-                        f"{name}: {words}"
-                    )
-                texts = [*axes.texts, axes.title, axes.xaxis.label, *axes.get_xticklabels()]
-                assert min(text.get_fontsize() for text in texts) >= FONT_PT, name
-                for legend in figure.legends:
-                    if hasattr(axes, "zaxis"):
-                        continue  # square axes behind the page; the box in space is smaller
-                    frame, words_box = axes.get_window_extent(), legend.get_window_extent(renderer)
-                    assert not frame.overlaps(words_box), f"{name}: legend over a panel"
+            check_readable(name, figure)
+
+
+ALL_PLANNERS = ("apf", "napf", "napf_guided", "qp", "qp_unguided")
+
+
+@pytest.mark.parametrize("runs", [3, 300, 10_000_000])
+@pytest.mark.parametrize(
+    "planners",
+    [
+        ("qp",),
+        ("napf", "napf_guided", "qp"),
+        ALL_PLANNERS,
+        (*ALL_PLANNERS, "a_planner_of_ones_own_with_a_long_name"),
+    ],
+)
+def test_figures_of_any_planners_and_numbers_of_runs_can_be_read(
+    planners: tuple[str, ...], runs: int
+) -> None:
+    parts = {name: front_point(0.1, 2.0, 0.5) | {"runs": runs, "uavs": 4} for name in planners}
+    lone = {name: part | {"uavs": 1} for name, part in parts.items()}
+    least = np.linspace(-0.5, 40.0, 10 * len(planners))
+    rows = {"planner": np.tile(planners, 10), "min_clearance_m": least}
+    reference = load_problem("table1_8").reference
+    for name, figure in {
+        "risk": risk_figure({"planners": parts}),
+        "published": risk_figure({"planners": parts}, reference),
+        "trade": trade_figure({"planners": parts}),
+        "trade of a lone UAV": trade_figure({"planners": lone}),
+        "clearance": clearance_figure({"planners": parts}, rows),
+        "no clearance": clearance_figure({"planners": parts}, rows | {"min_clearance_m": np.nan * least}),
+    }.items():
+        check_readable(name, figure)
+
+
+def test_a_world_without_obstacles_has_no_clearance_and_says_so() -> None:
+    summary = {"planners": {"apf": front_point(0.0, 2.0) | {"runs": 2}}}
+    rows = {"planner": np.array(["apf", "apf"]), "min_clearance_m": np.array([np.nan, np.nan])}
+    (axes,) = clearance_figure(summary, rows).axes
+    assert [words.get_text() for words in axes.texts] == ["no obstacles"]
+    rows["min_clearance_m"][0] = 1.0
+    (axes,) = clearance_figure(summary, rows).axes
+    assert [words.get_text() for words in axes.texts] == ["contact"]
+
+
+def test_a_lone_uav_has_no_shape_to_trade() -> None:
+    part = front_point(0.1, 2.0)
+    for uavs, panels in ((1, ["Path RMS (m)"]), (2, ["Shape RMS (m)", "Path RMS (m)"])):
+        figure = trade_figure({"planners": {"napf": part | {"uavs": uavs}}})
+        assert [axes.get_xlabel() for axes in figure.axes] == panels
+        assert figure.axes[0].get_ylabel() == "Collision risk (%)"
+        assert any("dashed" in text.get_text() for text in figure.texts) == (uavs > 1)
+
+
+def formation_of(uavs: int, planner: str = "napf_guided") -> Track:
+    """Flight of so many UAVs side by side, straight ahead."""
+    start = np.column_stack([np.zeros(uavs), np.linspace(0.0, 30.0, uavs), np.linspace(0.0, 3.0, uavs)])
+    positions = start + np.linspace([0.0, 0.0, 5.0], [60.0, 0.0, 5.0], 40)[:, None]
+    return replace(straight_track(positions), planner=planner)
+
+
+@pytest.mark.parametrize("uavs", [1, 5, 7, 8, 12, 40])
+def test_figures_of_any_formation_can_be_read(problem: Problem, obstacles: ObstacleSet, uavs: int) -> None:
+    flown = formation_of(uavs)
+    for name, figure in {
+        "paths": paths_figure(problem, flown, obstacles),
+        "uncertainty": uncertainty_figure(problem, flown, obstacles),
+        "motion": motion_figure(problem, flown),
+        "attitude": attitude_figure(problem, flown),
+        "distances": distance_figure(problem, flown, obstacles),
+        "space": space_figure(problem, flown, obstacles),
+        "axis": axis_figure(problem, [flown], 1),
+        "axes": axis_figure(problem, [flown, flown], 1),
+        "angle": angle_figure(problem, [flown], 0),
+    }.items():
+        check_readable(f"{name} of {uavs}", figure)
+
+
+@pytest.mark.parametrize("uavs", [4, 7, 8, 12])
+def test_an_overview_of_any_formation_can_be_read(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch, uavs: int
+) -> None:
+    monkeypatch.setattr(
+        "napf_mpc.plot.overview.track", lambda table, planner, run: formation_of(uavs, planner)
+    )
+    ball = ObstacleSet.from_shapes([Sphere((15.0, 0.0, 5.0), 1.0)])
+    missions = [Mission("apf", 0, "collided"), Mission("napf_guided", 0, "reached")]
+    figure = overview_figure(problem, {}, lambda run: ball, missions)
+    check_readable(f"overview of {uavs}", figure)
+    assert any(text.get_text() == "contact" for text in figure.legends[0].get_texts())
+
+
+@pytest.mark.parametrize("uavs", [7, 8, 12])
+def test_every_line_of_a_formation_has_a_colour_that_is_told(
+    problem: Problem, obstacles: ObstacleSet, uavs: int
+) -> None:
+    flown = formation_of(uavs)
+    for figure in (
+        motion_figure(problem, flown),
+        attitude_figure(problem, flown),
+        distance_figure(problem, flown, obstacles),
+    ):
+        drawn = [matplotlib.colors.to_hex(line.get_color()) for line in figure.axes[0].lines[:uavs]]
+        assert len(set(drawn)) == uavs
+        if uavs <= 7:
+            told = [matplotlib.colors.to_hex(line.get_color()) for line in figure.legends[0].get_lines()]
+        else:
+            (bar,) = [axes._colorbar.mappable for axes in figure.axes if hasattr(axes, "_colorbar")]
+            told = [matplotlib.colors.to_hex(bar.cmap(bar.norm(uav + 1))) for uav in range(uavs)]
+            assert any(text.get_text() == "UAV" for text in figure.texts)
+        assert told == drawn
 
 
 def test_credit_of_shared_data_is_on_the_figures(
@@ -840,3 +970,5 @@ def test_neither_pyplot_nor_a_display_nor_the_users_settings_are_touched() -> No
 def test_colours_of_uavs_differ() -> None:
     assert len({matplotlib.colors.to_rgb(uav_colour(uav)) for uav in range(7)}) == 7
     assert uav_colour(7) == uav_colour(0)
+    for uavs in (8, 12, 40):
+        assert len({uav_colour(uav, uavs) for uav in range(uavs)}) == uavs
