@@ -17,6 +17,7 @@ import typer
 
 from napf_mpc import interrupts
 from napf_mpc.errors import NapfError, ProblemError
+from napf_mpc.words import shown_value
 
 if TYPE_CHECKING:
     from napf_mpc.problem import Problem
@@ -96,7 +97,7 @@ def run_command(arguments: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
         return code
     except _UsageError as error:
-        _complain(error.format_message())
+        _complain(_usage(error))
     except NapfError as error:
         _complain(str(error))
     except MemoryError:
@@ -110,6 +111,27 @@ def run_command(arguments: Sequence[str] | None = None) -> int:
         else:
             raise
     return 2
+
+
+_WANTED = {
+    "int": "must be a whole number in digits, such as 1000",
+    "float": "must be a number",
+    "greater_than_equal": "must be a number of at least {ge:.10g}",
+    "less_than_equal": "must be a number of at most {le:.10g}",
+}
+"""What is allowed, by the beginning of pydantic's name of a fault."""
+
+
+def _usage(error: Any) -> str:
+    """What the parser complains of, with the value and what is allowed instead in plain words."""
+    text: str = error.format_message()
+    cause = error.__cause__
+    if not hasattr(cause, "errors"):  # a version of typer that does without pydantic names the value
+        return text
+    (fault, *_) = cause.errors()
+    wanted = next((words for kind, words in _WANTED.items() if fault["type"].startswith(kind)), None)
+    allowed = fault["msg"] if wanted is None else wanted.format(**fault.get("ctx", {}))
+    return f"{text.removesuffix(error.message)}{shown_value(fault['input'])}: {allowed}"
 
 
 def _drop_output() -> None:
