@@ -24,6 +24,8 @@ from napf_mpc.prefix import Prefix
 from napf_mpc.problem import Problem
 from napf_mpc.provenance import identity, versions
 from napf_mpc.scenario_file import write_scenario
+from napf_mpc.solvers.batch import check_solver_name
+from napf_mpc.solvers.solver import SolverError
 from napf_mpc.summary import summarise
 from napf_mpc.words import shown_value
 from napf_mpc.workers import Lost, in_pool, in_workers
@@ -32,6 +34,7 @@ __all__ = [
     "Block",
     "Missions",
     "check_flyable",
+    "check_solver",
     "compare",
     "fly_block",
     "run_campaign",
@@ -228,6 +231,20 @@ def _kept(
     return None
 
 
+def check_solver(problem: Problem) -> None:
+    """Refuse a solver that nobody has registered, whether the planner that flies has one or not.
+
+    Raises
+    ------
+    ProblemError
+        If ``planner.solver`` is not known.
+    """
+    try:
+        check_solver_name(problem.planner.solver)
+    except SolverError as error:
+        raise ProblemError("planner.solver", [str(error)]) from error
+
+
 def check_flyable(
     problem: Problem, planners: Sequence[str], seed: int = 0, data_folder: Path | None = None
 ) -> Scenario:
@@ -241,8 +258,10 @@ def check_flyable(
     Raises
     ------
     NapfError
-        If a planner is not built, the scene cannot be built, data are missing, or the inner loop is unstable.
+        If the solver is not known, a planner is not built, the scene cannot be built, data are missing, or
+        the inner loop is unstable.
     """
+    check_solver(problem)
     for planner in planners:
         make_planner(planner, problem)
     return build_scenario(problem, seed, range(1), data_folder)

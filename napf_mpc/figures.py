@@ -10,6 +10,7 @@ import numpy as np
 
 from napf_mpc import plot, store
 from napf_mpc.block import check_campaign, fly_block
+from napf_mpc.campaign import check_solver
 from napf_mpc.errors import DataError
 from napf_mpc.plot.field import surface_figure, walk_figure
 from napf_mpc.plot.style import credit_of, house_style, save
@@ -72,6 +73,7 @@ def draw_problem(
 ) -> list[Path]:
     """Fly run 0 of a seed and draw the paper's figures for a problem."""
     check_campaign(["apf"], 1, seed)
+    check_solver(problem)
     return plot.paper_figures(problem, name, seed, store.output_folder(out), data_folder)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from napf_mpc import store
 from napf_mpc.block import MAX_RUNS, Block, check_campaign, fly_block
-from napf_mpc.campaign import check_flyable
+from napf_mpc.campaign import check_flyable, check_solver
 from napf_mpc.campaign_folder import taken
 from napf_mpc.errors import DataError, ProblemError
 from napf_mpc.evaluate import Outcome
@@ -17,8 +17,6 @@ from napf_mpc.planners.registry import make_planner
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.provenance import data_digests, identity
 from napf_mpc.scenario_file import moving_of, scenes_of, write_scenario
-from napf_mpc.solvers.batch import check_solver_name
-from napf_mpc.solvers.solver import SolverError
 from napf_mpc.summary import summarise
 from napf_mpc.words import shown_value
 from napf_mpc.world.moving import MovingObstacles
@@ -60,10 +58,7 @@ def check_mission(problem: Problem, data_folder: Path | None = None) -> str:
         If the problem cannot be flown: planner, scene, inner loop, or what is in its data files.
     """
     flies = isinstance(problem.mission, FormationMission)
-    try:
-        check_solver_name(problem.planner.solver)  # whether the problem's own planner has one or not
-    except SolverError as error:
-        raise ProblemError("planner.solver", [str(error)]) from error
+    check_solver(problem)
     try:
         data_digests(problem, data_folder)
     except DataError as missing:
@@ -110,6 +105,7 @@ def fly_mission(
         If a setting or the problem is not usable, data are missing, or the folder cannot be used.
     """
     check_campaign([planner], 1, seed)
+    check_solver(problem)
     if not 0 <= run < MAX_RUNS:
         raise ProblemError(
             "campaign", [f"run-index = {shown_value(run)}: must be a whole number from 0 to {MAX_RUNS - 1}"]

@@ -18,6 +18,7 @@ from napf_mpc import interrupts, store
 from napf_mpc.cli import run_command
 from napf_mpc.problem_file import load_problem
 from napf_mpc.scenario_file import read_scenes
+from napf_mpc.solvers import solver
 
 PROBLEM = """
 title = "Five seconds among four balls"
@@ -344,6 +345,40 @@ def test_a_solver_that_is_not_known_is_told_with_its_key(
         assert (code, out) == (2, "")
         assert err.startswith("error: planner.solver: ")
         assert "'nosuch' is not known; choose from" in err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "validate P",
+        "validate single_uav",
+        "run P --planner napf --out O",
+        "run single_uav --planner apf --out O",
+        "compare P --planners apf,napf --runs 1 --out O",
+        "montecarlo P --planner napf --runs 1 --out O",
+        "sweep P --vary planner.k=1,2 --planners napf --runs 1 --out O",
+        "rare P --planner napf --samples 20 --out O",
+    ],
+)
+def test_a_solver_that_is_not_known_is_refused_by_planners_without_one(
+    words: str,
+    problem: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is not valid does not fly, whoever would fly it; what somebody has registered does."""
+    places = {"P": problem, "O": str(tmp_path / "out")}
+    command = [places.get(word, word) for word in words.split()]
+    code, out, err = done(capsys, *command, "--set", 'planner.solver="osqpp"')
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+    assert "planner.solver: solver 'osqpp' is not known; choose from osqp, " in err
+    assert err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+    if command[0] in ("validate", "run"):
+        monkeypatch.setitem(solver._FACTORIES, "osqpp", solver.register_solver)
+        assert done(capsys, *command, "--set", 'planner.solver="osqpp"')[0] in (0, 1)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "cp932"])

@@ -172,6 +172,9 @@ def test_a_problem_gets_the_figures_of_the_paper(tmp_path: Path, asked: dict[str
     assert (tmp_path / "new").is_dir()
     with pytest.raises(ProblemError, match="seed = -1"):
         draw_problem(brief(), "brief", -1, tmp_path)
+    unknown = load_problem("table1_8", BRIEF | {"planner.solver": "osqpp"})
+    with pytest.raises(ProblemError, match=r"planner\.solver: solver 'osqpp' is not known"):
+        draw_problem(unknown, "brief", 3, tmp_path)
 
 
 @pytest.mark.parametrize(

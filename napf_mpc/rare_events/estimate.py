@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from napf_mpc import store
 from napf_mpc.block import check_campaign
+from napf_mpc.campaign import check_solver
 from napf_mpc.campaign_folder import taken
 from napf_mpc.errors import DataError, ProblemError
 from napf_mpc.problem import Problem
@@ -80,6 +81,7 @@ def estimate_collision_risk(
         If a setting or the problem is not usable, data are missing, or the folder cannot be used.
     """
     check_campaign([planner], 1, seed)
+    check_solver(problem)
     check_samples(samples)
     limit = LeastClearance(problem, planner, seed, data_folder)
     if samples * limit.dimension > MAX_NUMBERS:
