@@ -1,5 +1,6 @@
 """The command ``napf-mpc``, also as ``python -m napf_mpc``."""
 
+import os
 from typing import NoReturn
 
 from napf_mpc import interrupts
@@ -11,6 +12,8 @@ def main() -> NoReturn:
 
 
 def _command() -> int:
+    # No figure of a command needs a window, and matplotlib does not load with a backend that is not there.
+    os.environ["MPLBACKEND"] = "agg"
     from napf_mpc.cli import run_command  # a stop while this loads is a clean one too
 
     return run_command()

@@ -381,6 +381,17 @@ def test_a_solver_that_is_not_known_is_refused_by_planners_without_one(
         assert done(capsys, *command, "--set", 'planner.solver="osqpp"')[0] in (0, 1)
 
 
+def test_a_backend_of_matplotlib_that_is_not_there_is_no_matter(problem: str, tmp_path: Path) -> None:
+    """Some set it for windows of their own; commands draw into files."""
+    out = tmp_path / "out"
+    shown = process(
+        "run", problem, "--planner", "apf", "--out", out, env={**os.environ, "MPLBACKEND": "nope"}
+    )
+    assert shown.stderr == ""
+    assert shown.returncode in (0, 1)
+    assert (out / "brief_apf_paths.png").stat().st_size > 0
+
+
 @pytest.mark.parametrize("encoding", ["ascii", "cp932"])
 def test_a_sign_that_the_output_does_not_have_is_no_reason_to_fail(problem: str, encoding: str) -> None:
     """Redirected on a Japanese Windows, for one, standard output has no superscript two."""
