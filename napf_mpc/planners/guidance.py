@@ -24,7 +24,7 @@ from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import SolidBoxes, frame_of, solid_boxes
 from napf_mpc.planners.guide_search import plan_all, resample_all, resample_taut
-from napf_mpc.planners.guide_settings import FINE, GuidanceSettings, search_of
+from napf_mpc.planners.guide_settings import ANY_HEIGHT, FINE, GuidanceSettings, search_of
 from napf_mpc.planners.guide_sky import NO_SKY, SkyField, sky_field
 from napf_mpc.planners.guide_traffic import TrafficPace, slowed
 from napf_mpc.planners.passes import everybody
@@ -86,7 +86,7 @@ class Guidance:
     ) -> None:
         if not isinstance(problem.mission, FormationMission):
             raise ProblemError("mission.kind", ['must be "formation" for guidance, not "goal"'])
-        self.settings = settings or GuidanceSettings()
+        self.settings = (settings or GuidanceSettings()).at_speed(problem.mission.speed_mps)
         self._inflation = inflation
         self._path = PathFrame.of_mission(problem.mission)
         self._frame = frame_of(self._path)
@@ -101,14 +101,18 @@ class Guidance:
         if margins is None:
             margins = half_space_margins(inflation.k)
         self._open_sky_weight = problem.planner.open_sky_weight
-        self._search = search_of(self.settings, margins, problem.vehicle.radius_m, self._open_sky_weight)
+        finish = np.array([problem.mission.length_m, 0.0, 0.0])
+        ends = self._path.to_world(np.concatenate([self._slots, self._slots + finish]))
+        room = _height_room(problem.planner.altitude_m, ends)
+        radius = problem.vehicle.radius_m
+        self._search = search_of(self.settings, margins, radius, self._open_sky_weight, room)
         self._clearance = Clearance(
             inflation.k,
             problem.vehicle.radius_m,
             problem.planner.contact_extra_m,
             problem.planner.contact_extra_sigmas,
         )
-        self._blind = search_of(self.settings, margins, problem.vehicle.radius_m)
+        self._blind = search_of(self.settings, margins, radius, room_m=room)
         stations = (self._search.lattice.stations - 1) * FINE + 1
         self._step_m = self._search.lattice.step_m / FINE
         self._bends = max(2, round(self.settings.bend_m / self._step_m) + 1)
@@ -321,6 +325,14 @@ class Guidance:
         taut, (loose, room) = np.empty(offset.shape), np.empty((2, *offset.shape[:3]))
         resample_taut(*self._taut, along - self._planned_at, self._step_m, taut, loose, room)
         return Guide(self.ahead_m, offset, pace, reason, breach, taut, loose, room)
+
+
+def _height_room(band_m: tuple[float, float] | None, places: Array) -> tuple[float, float]:
+    """How far all places (n, 3) may be left upwards and downwards within a band of heights [m]."""
+    if band_m is None:
+        return ANY_HEIGHT
+    heights = places[:, 2]
+    return band_m[1] - float(heights.max()), float(heights.min()) - band_m[0]
 
 
 # Codes as plain numbers, for the compiled loop.

@@ -275,7 +275,7 @@ def plan_run(
         )
         upwards = upwards or up
         downwards = downwards and (down or count[i] == 0)
-    downwards = downwards and upwards
+    downwards = downwards and upwards and lattice.sphere_layers > 0
     below = lattice.sphere_layers // 2 if downwards else 0
     layers = 1
     if upwards:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 from napf_mpc.constraints.passage import PassageMargins
 from napf_mpc.planners.guide_lattice import Lattice
@@ -15,8 +16,10 @@ FINE = 2
 
 @dataclass(frozen=True)
 class GuidanceSettings:
-    """What guidance weighs against what; one set for all scenes."""
+    """What guidance weighs against what; one set for all scenes, see :meth:`at_speed`."""
 
+    usual_mps: float = 4.0
+    """Lengths along the path are for formation speeds up to this; beyond, they grow with the speed [m/s]."""
     period_s: float = 0.4
     """Time between plans [s]."""
     ahead_m: float = 48.0
@@ -115,9 +118,40 @@ class GuidanceSettings:
     left_behind_m: float = 3.0
     """A UAV this far behind its slot, with two sigma to that, is waited for [m]."""
 
+    def at_speed(self, speed_mps: float) -> GuidanceSettings:
+        """The same for a speed [m/s]: beyond ``usual_mps`` ways are as much longer, not as much steeper.
 
-def _lattice(settings: GuidanceSettings, scale: int) -> Lattice:
+        Who is faster needs the time that others need to go aside and to brake. All lengths along the path are
+        multiplied by one number and slopes divided by it; prices are such that the same ways stay cheapest.
+        """
+        scale = speed_mps / self.usual_mps
+        if scale <= 1.0:
+            return self
+        return replace(
+            self,
+            ahead_m=self.ahead_m * scale,
+            step_m=self.step_m * scale,
+            bend_m=self.bend_m * scale,
+            stop_m=self.stop_m * scale,
+            slow_m=self.slow_m * scale,
+            release_m=self.release_m * scale,
+            left_behind_m=self.left_behind_m * scale,
+            steep=self.steep / scale,
+            steep_far=self.steep_far / scale,
+            taut_slope=self.taut_slope / scale,
+            flown_slope=self.flown_slope / scale,
+            slope=self.slope * scale**2,
+            bend=self.bend * scale**4,
+        )
+
+
+ANY_HEIGHT = math.inf, math.inf
+"""No limit to how far UAVs may climb and sink."""
+
+
+def _lattice(settings: GuidanceSettings, scale: int, room_m: tuple[float, float]) -> Lattice:
     step, layer = settings.step_m * scale, settings.layer_m * scale
+    up, down = (max(0, math.floor(min(room, 1e6) / layer)) for room in room_m)
     return Lattice(
         round(settings.ahead_m / step) + 1,
         step,
@@ -125,8 +159,8 @@ def _lattice(settings: GuidanceSettings, scale: int) -> Lattice:
         round(settings.widest_m / settings.cell_m),
         settings.cell_m * scale,
         layer,
-        round(settings.highest_m / layer),
-        settings.sphere_layers,
+        min(round(settings.highest_m / layer), up),
+        min(settings.sphere_layers, 2 * min(up, down)),
     )
 
 
@@ -159,15 +193,30 @@ def _prices(settings: GuidanceSettings, scale: int, open_sky_weight: float) -> P
 
 
 def search_of(
-    settings: GuidanceSettings, margins: PassageMargins, radius_m: float, open_sky_weight: float = 0.0
+    settings: GuidanceSettings,
+    margins: PassageMargins,
+    radius_m: float,
+    open_sky_weight: float = 0.0,
+    room_m: tuple[float, float] = ANY_HEIGHT,
 ) -> Search:
-    """Settings in the form that the compiled search reads, for margins and a radius [m].
+    """Settings in the form that the compiled search reads.
 
-    ``open_sky_weight`` is what a squared metre of a fix's variance costs, in squared metres of offset.
+    Parameters
+    ----------
+    settings : GuidanceSettings
+        At the formation's speed.
+    margins : PassageMargins
+        Sigmas to keep.
+    radius_m : float
+        Of a UAV [m].
+    open_sky_weight : float
+        What a squared metre of a fix's variance costs, in squared metres of offset.
+    room_m : tuple of float
+        How far all UAVs may leave their lanes upwards, and downwards [m].
     """
     return Search(
-        _lattice(settings, 1),
-        _lattice(settings, 2),
+        _lattice(settings, 1, room_m),
+        _lattice(settings, 2, room_m),
         settings.wide_m,
         _prices(settings, 1, open_sky_weight),
         _prices(settings, 2, open_sky_weight),

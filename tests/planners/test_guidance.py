@@ -308,6 +308,79 @@ def test_a_small_k_makes_raw_measurements_no_steadier_for_the_qp(
     assert (Passage.HOLD in reasons(guides)) == held
 
 
+@pytest.mark.parametrize(
+    ("band", "climbs", "aside"),
+    [
+        (None, True, False),
+        ((-20.0, 20.0), True, False),
+        ((-20.0, 2.0), False, True),
+        ((-1.0, 1.0), False, True),
+    ],
+)
+def test_no_way_leads_out_of_the_altitude_band(
+    band: tuple[float, float] | None, climbs: bool, aside: bool
+) -> None:
+    # A wall three metres above the lanes, with its end 12 m to the right of the rightmost.
+    wall = Box((60.0, 30.0, -50.0), (2.0, 96.0, 106.0), 0.0)
+    made = guidance([wall], planner={"altitude_m": band})
+    places, guides = follow(made)
+    offsets = np.concatenate([guide.offset[0].reshape(-1, 2) for guide in guides])
+    assert (offsets[:, 1].max() > 3.0) == climbs
+    assert (offsets[:, 0].min() < -12.0) == aside
+    assert places[-1][:, 0].min() >= 110.0
+    if band is not None:
+        assert offsets[:, 1].max() <= band[1]
+        assert offsets[:, 1].min() >= band[0]
+    assert clearance(made, places) > 0.5 * K_SIGMA
+
+
+def test_spheres_are_passed_above_where_the_band_leaves_no_room_below() -> None:
+    made = guidance(
+        [Sphere((60.0, y, 0.0), 4.0) for y in (-12.0, -4.0, 4.0, 12.0)], planner={"altitude_m": (0.0, 30.0)}
+    )
+    _, guides = follow(made)
+    heights = np.concatenate([guide.offset[0, ..., 1].ravel() for guide in guides])
+    assert heights.max() > 4.0
+    assert heights.min() >= -0.1
+
+
+def fast(speed_mps: float) -> Problem:
+    """Four UAVs in a line across, 6 m apart, and a gap of 10 m in a wall before them."""
+    walls = [
+        {"shape": "box", "centre_m": (150.0, y, 0.0), "size_m": (2.0, 100.0, 100.0), "heading_deg": 0.0}
+        for y in (-54.0, 56.0)
+    ]
+    return problem(
+        formation={"shape": "line", "count": 4, "spacing_m": 6.0, "bearing_deg": 90.0},
+        mission={"kind": "formation", "length_m": 300.0, "speed_mps": speed_mps},
+        world={"kind": "list", "obstacles": tuple(walls)},
+        navigation={
+            "kind": "gauss_markov", "sigma_min_m": 0.3, "sigma_max_m": 1.0, "correlation_time_s": 10.0,
+            "sigma_period_s": 20.0, "filter": "kalman",
+        },
+        simulation={"time_limit_s": 100.0},
+    )  # fmt: skip
+
+
+def test_who_is_faster_looks_farther_and_goes_aside_in_time() -> None:
+    """At 10 m/s with the lengths of 2 m/s 39 of 40 missions hit the wall."""
+    flown = simulate(fast(10.0), "qp", seed=7600, runs=10).score
+    assert not flown.obstacle_contact.any()
+    assert flown.finished.all()
+
+
+def test_lengths_along_the_path_grow_with_the_speed_beyond_the_usual() -> None:
+    assert SETTINGS.at_speed(SETTINGS.usual_mps) is SETTINGS
+    twice = SETTINGS.at_speed(2.0 * SETTINGS.usual_mps)
+    assert (twice.ahead_m, twice.step_m, twice.stop_m) == (96.0, 4.0, 8.0)
+    # One bend, flown by one and at twice the speed over twice the length, costs twice as much as all else.
+    rise, length = 3.0, 10.0
+    for price, power in ((lambda s: s.slope, 2), (lambda s: s.bend, 4)):
+        one = price(SETTINGS) * (rise / length ** (power // 2)) ** 2 * length
+        other = price(twice) * (rise / (2.0 * length) ** (power // 2)) ** 2 * 2.0 * length
+        assert other == pytest.approx(2.0 * one)
+
+
 def test_a_hold_ends_when_navigation_gets_better() -> None:
     made = guidance(gap(2.0 * (RADIUS + K_SIGMA) + 0.6), GuidanceSettings(squeeze_m=0.0))
     place = advanced(49.0)  # the first of them 3.6 m before the wall
