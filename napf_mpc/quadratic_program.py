@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,6 +132,8 @@ class Values:
 class QuadraticProgram:
     """Minimise ``z' P z / 2 + q' z`` subject to ``l <= A z <= u``; checked when it is made.
 
+    Matrices may come dense or in any sparse form, vectors as lists: they are kept as the fields say.
+
     Raises
     ------
     QpError
@@ -149,7 +152,16 @@ class QuadraticProgram:
     """(m,) bounds, +inf where there is none."""
 
     def __post_init__(self) -> None:
-        faults = self._shape_faults() or self._value_faults()
+        faults: list[str] = []
+        for field, name, formed in (
+            ("p", "P", _matrix), ("q", "q", _vector), ("a", "A", _matrix), ("lower", "l", _vector),
+            ("upper", "u", _vector),
+        ):  # fmt: skip
+            try:
+                object.__setattr__(self, field, formed(getattr(self, field)))
+            except (TypeError, ValueError) as error:
+                faults.append(f"{name} {error}")
+        faults = faults or self._shape_faults() or self._value_faults()
         if faults:
             raise QpError("; ".join(faults))
 
@@ -195,12 +207,6 @@ class QuadraticProgram:
             return ["there are no variables"]
         shapes = (("P", self.p.shape, (n, n)), ("A", self.a.shape, (m, n)), ("u", self.upper.shape, (m,)))
         faults = [f"{name} has shape {got}, must be {want}" for name, got, want in shapes if got != want]
-        for name, matrix in (("P", self.p), ("A", self.a)):
-            try:
-                # An index outside makes C code read stray memory.
-                matrix.check_format(full_check=True)
-            except ValueError as error:
-                faults.append(f"{name} is not a valid sparse matrix: {error}")
         return faults
 
     def _value_faults(self) -> list[str]:
@@ -249,6 +255,37 @@ class QuadraticProgram:
         up = np.where(np.isfinite(self.upper), np.abs(over), 1.0) * np.maximum(y, 0.0)
         down = np.where(np.isfinite(self.lower), np.abs(under), 1.0) * np.maximum(-y, 0.0)
         return Residuals(_largest(over, under), _largest(dual), _largest(up, down))
+
+
+def _matrix(given: Any) -> sparse.csc_array:
+    """Matrix by columns, itself if it is one."""
+    is_sparse: bool = sparse.issparse(given)
+    if is_sparse:
+        if hasattr(given, "check_format"):
+            try:
+                # An index outside makes C code read stray memory, that of a conversion, too.
+                given.check_format(full_check=True)
+            except ValueError as error:
+                raise ValueError(f"is not a valid sparse matrix: {error}") from error
+        if given.dtype.kind == "c":
+            raise TypeError("does not hold real numbers: they are complex")
+        if isinstance(given, sparse.csc_array) and given.dtype == np.float64:
+            return given
+    else:
+        given = _vector(given)
+    if given.ndim != 2:
+        raise ValueError(f"has {given.ndim} axes, must have 2")
+    return sparse.csc_array(given, dtype=np.float64)
+
+
+def _vector(given: Any) -> Array:
+    """Array of numbers, itself if it is one."""
+    try:
+        if np.iscomplexobj(given):
+            raise TypeError("they are complex")
+        return np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"does not hold real numbers: {error}") from error
 
 
 def _largest(*arrays: Array) -> float:
