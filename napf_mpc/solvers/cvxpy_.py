@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.quadratic_program import QpStatus, QuadraticProgram, Sparsity, Values
-from napf_mpc.solvers.solver import Answer, MakeBackend, Warm
+from napf_mpc.solvers.solver import Answer, MakeBackend, Warm, tried
 
 DEFAULTS = {"solver": "CLARABEL", "tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 """Tight, as a second opinion should be."""
@@ -26,9 +26,15 @@ _STATUS = {
 
 
 def maker(name: str, **settings: Any) -> MakeBackend:
-    """Maker of cvxpy back-ends; settings are those of ``cvxpy.Problem.solve``, Clarabel by default."""
+    """Maker of cvxpy back-ends; settings are those of ``cvxpy.Problem.solve``, Clarabel by default.
+
+    Raises
+    ------
+    TypeError
+        For a setting that cvxpy's solver does not know, or a value that is none.
+    """
     chosen = settings if "solver" in settings else {**DEFAULTS, **settings}
-    return lambda sparsity: CvxpyBackend(sparsity, chosen)
+    return tried(lambda sparsity: CvxpyBackend(sparsity, chosen), settings)
 
 
 class CvxpyBackend:

@@ -27,7 +27,7 @@ from scipy.sparse.linalg import splu
 from napf_mpc.jit import compiled
 from napf_mpc.quadratic_program import Array, Index, QpStatus, Sparsity, Values
 from napf_mpc.solvers.presolve import Part, Slacks
-from napf_mpc.solvers.solver import Answer, MakeBackend, Warm
+from napf_mpc.solvers.solver import Answer, MakeBackend, Warm, tried
 
 DEFAULTS: dict[str, Any] = {
     "eps_abs": 1e-5,
@@ -81,7 +81,7 @@ def maker(name: str, **settings: Any) -> MakeBackend:
     Raises
     ------
     TypeError
-        For a setting that OSQP does not have, or that is ours.
+        For a setting that OSQP does not have, or that is ours, or a value that is none.
     """
     known = osqp.OSQP(algebra="builtin").ext.OSQPSettings.__dict__
     for key in settings:
@@ -89,7 +89,7 @@ def maker(name: str, **settings: Any) -> MakeBackend:
             raise TypeError(f"setting {key!r} is not known")
     chosen = {**DEFAULTS, **settings, **OURS}
     compliances = Compliances()
-    return lambda sparsity: OsqpBackend(sparsity, chosen, compliances)
+    return tried(lambda sparsity: OsqpBackend(sparsity, chosen, compliances), settings)
 
 
 class Compliances:

@@ -11,7 +11,7 @@ import qpsolvers
 from scipy import sparse
 
 from napf_mpc.quadratic_program import QpStatus, Sparsity, Values
-from napf_mpc.solvers.solver import Answer, MakeBackend, Warm
+from napf_mpc.solvers.solver import Answer, MakeBackend, Warm, tried
 
 DENSE = ("daqp", "quadprog")
 """Solvers that take dense matrices only."""
@@ -20,6 +20,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "proxqp": {"eps_abs": 1e-9, "eps_rel": 0.0},
     # It solves semi-definite programs by proximal steps only.
     "daqp": {"eps_prox": 1e-6},
+    # On badly scaled programs it goes round for ever, and Ctrl-C does not reach it.
+    "highs": {"time_limit": 5.0},
 }
 """Settings that differ from the solver's own defaults."""
 _WORDS = (
@@ -40,13 +42,16 @@ def maker(name: str, **settings: Any) -> MakeBackend:
     ------
     ImportError
         If the solver itself is not installed.
+    TypeError
+        For a setting that it does not know, or a value that is none.
     """
     if name not in qpsolvers.available_solvers:
         raise ImportError(f"qpsolvers finds no {name}")
     if name == "highs":
         _swallow_banner()
+        _refuse_unknown_options(settings)
     chosen = {**DEFAULTS.get(name, {}), **settings}
-    return lambda sparsity: QpsolversBackend(name, sparsity, chosen)
+    return tried(lambda sparsity: QpsolversBackend(name, sparsity, chosen), settings)
 
 
 class QpsolversBackend:
@@ -78,6 +83,11 @@ class QpsolversBackend:
             warnings.simplefilter("ignore")
             solution = qpsolvers.solve_problem(problem, self._name, **self._settings)
         said = _own_status(solution)
+        limit_s = self._settings.get("time_limit", np.inf) if self._name == "highs" else np.inf
+        if not solution.found and solution.solve_time is not None and solution.solve_time >= limit_s:
+            # The adapter hands no status on, but the time.
+            message = f"{self._name}: no solution found in {limit_s:g} s"
+            return Answer.none(places, QpStatus.MAX_ITERATIONS, message)
         if not solution.found or solution.x is None:
             return Answer.none(places, _translated(said), f"{self._name}: {said or 'no solution found'}")
         y = np.zeros(m)
@@ -106,6 +116,19 @@ def _swallow_banner() -> None:
         highs.enableCallbacks(instance)
 
     type("Mute", (highs,), {"enableCallbacks": enable_mute})()
+
+
+def _refuse_unknown_options(settings: dict[str, Any]) -> None:
+    """Refuse options that HiGHS would pass over without a word."""
+    import highspy
+
+    highs: Any = highspy.Highs
+    solver = highs()
+    solver.setOptionValue("log_to_console", False)
+    for name, value in settings.items():
+        # ``verbose`` is of qpsolvers.
+        if name != "verbose" and solver.setOptionValue(name, value) != highspy.HighsStatus.kOk:
+            raise TypeError(f"{name} = {value!r}: is not an option of HiGHS, or not a value of it")
 
 
 def _own_status(solution: Any) -> str:

@@ -6,7 +6,7 @@ checks live here, so that a library never sees what it would crash on or answer 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Protocol
@@ -124,6 +124,26 @@ def take_name(name: str) -> None:
 def solver_names() -> tuple[str, ...]:
     """Names of all solvers, installed or not."""
     return (*_SHIPPED, *_FACTORIES)
+
+
+def tried(make: MakeBackend, settings: Mapping[str, object]) -> MakeBackend:
+    """Maker whose settings, if there are any, the library has taken for a program of one variable.
+
+    For libraries that look at settings only when they solve.
+
+    Raises
+    ------
+    TypeError
+        Naming the settings, and what the library raised.
+    """
+    if settings:
+        place, one = np.zeros(1, dtype=np.int64), np.ones(1)
+        try:
+            make(Sparsity(1, 1, place, place, place, place)).solve(Values(one, one, one, -one, one), None)
+        except Exception as error:
+            named = ", ".join(f"{name} = {value!r}" for name, value in settings.items())
+            raise TypeError(f"{named}: {type(error).__name__}: {error}") from error
+    return make
 
 
 def backend_maker(name: str, **settings: object) -> MakeBackend:

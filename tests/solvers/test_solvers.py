@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -355,6 +357,60 @@ def test_unsorted_and_repeated_entries_are_the_same_program(solver_name: str) ->
     np.testing.assert_allclose(z, [0, 1], atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    "form",
+    [
+        sparse.csc_array, sparse.csr_array, sparse.coo_array, sparse.csr_matrix, sparse.dok_array, np.asarray,
+        list,
+    ],
+)  # fmt: skip
+def test_a_matrix_of_any_form_is_the_same_program(form: Any) -> None:
+    p, rows = [[2.0, 0.0], [0.0, 2.0]], [[1.0, 2.0], [0.0, 1.0]]
+    lower, upper = [-1, -1], [INF, INF]
+    # The rows say x + 2 y >= -1 and y >= -1; read as columns they would ask 2 x + y >= -1 instead.
+    given = QuadraticProgram(form(p), [2, 2], form(rows), lower, upper)  # type: ignore[arg-type]
+    solver = make_solver("osqp")
+    solver.setup(given)
+    result = solver.solve()
+    assert result.status is QpStatus.SOLVED
+    np.testing.assert_allclose(result.z, [-0.6, -0.2], atol=1e-6)
+    assert given.residuals(result.z, result.y).within(1e-6, 1e-6)
+    assert (np.array(rows) @ result.z >= -1 - 1e-6).all()
+
+
+def test_numbers_that_are_in_form_are_not_copied() -> None:
+    good = CASES[2].program
+    again = replace(good)
+    for name in ("p", "q", "a", "lower", "upper"):
+        assert getattr(again, name) is getattr(good, name)
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"p": sparse.csc_array(1j * EYE)}, "P does not hold real numbers: they are complex"),
+        ({"a": 1j * EYE}, "A does not hold real numbers: they are complex"),
+        ({"q": np.array([1j, 0])}, "q does not hold real numbers: they are complex"),
+        ({"q": ["a", 0]}, "q does not hold real numbers: could not convert string to float: 'a'"),
+        ({"a": [[1.0, 0.0], [1.0]]}, "A does not hold real numbers: .*inhomogeneous"),
+        ({"a": None}, "A has 0 axes, must have 2"),
+        ({"q": None}, "q has 0 axes, must have 1"),
+        ({"upper": 1.0}, "u has 0 axes, must have 1"),
+        ({"a": "none"}, "A does not hold real numbers"),
+    ],
+)
+def test_what_is_no_matrix_of_numbers_is_refused_by_name(changes: dict[str, Any], fault: str) -> None:
+    with pytest.raises(QpError, match=fault):
+        replace(CASES[2].program, **changes)
+
+
+def test_index_outside_of_rows_never_reaches_a_conversion() -> None:
+    rows = sparse.csr_array(np.eye(2))
+    rows.indices[1] = 7
+    with pytest.raises(QpError, match="A is not a valid sparse matrix"):
+        replace(CASES[2].program, a=rows)
+
+
 def test_order_of_calls() -> None:
     solver = make_solver("osqp")
     with pytest.raises(QpError, match="setup before solve"):
@@ -374,6 +430,61 @@ def test_unknown_names_missing_extras_and_settings() -> None:
             make_solver(name)
     with pytest.raises(SolverError, match="exists already"):
         register_solver("osqp", lambda: lambda sparsity: None)  # type: ignore[arg-type, return-value]
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "fault"),
+    [
+        ("daqp", {"nope": 1}, "nope = 1.*unexpected keyword"),
+        ("daqp", {"eps_prox": "small"}, "eps_prox = 'small'.*must be real number"),
+        ("clarabel", {"nope": 1}, "nope = 1.*no attribute"),
+        ("highs", {"nope": 1}, "nope = 1: is not an option of HiGHS"),
+        ("highs", {"time_limit": -1.0}, "time_limit = -1.0: is not .* a value"),
+        ("cvxpy", {"nope": 1}, "nope = 1.*unrecognized solver setting"),
+        ("cvxpy", {"solver": "NOPE"}, "solver = 'NOPE'.*not installed"),
+        ("osqp", {"eps_abs": -1.0}, "eps_abs = -1.0: OSQPException"),
+        ("osqp", {"eps_abs": "small"}, "eps_abs = 'small': TypeError"),
+        ("piqp", {"nope": 1}, "no setting 'nope'"),
+    ],
+)
+def test_a_setting_that_a_library_does_not_take_is_refused_when_the_solver_is_made(
+    name: str, settings: dict[str, Any], fault: str
+) -> None:
+    if name not in SOLVERS:
+        pytest.skip(f"{name} is not installed")
+    with pytest.raises(SolverError, match=f"solver '{name}': .*{fault}"):
+        make_solver(name, **settings)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("daqp", {"eps_prox": 1e-5}),
+        ("clarabel", {"max_iter": 50}),
+        ("highs", {"time_limit": 3, "presolve": "off"}),
+        ("cvxpy", {"solver": "OSQP", "eps_abs": 1e-9}),
+        ("osqp", {"max_iter": 1}),
+    ],
+)
+def test_a_setting_that_a_library_takes_is_taken(name: str, settings: dict[str, Any]) -> None:
+    if name not in SOLVERS:
+        pytest.skip(f"{name} is not installed")
+    make_solver(name, **settings)
+
+
+def test_highs_gives_up_in_time() -> None:
+    """On curvatures 24 powers of ten apart its active-set method goes round for ever, deaf to Ctrl-C."""
+    qpsolvers_ = pytest.importorskip("napf_mpc.solvers.qpsolvers_")
+    if "highs" not in SOLVERS:
+        pytest.skip("highs is not installed")
+    assert 1.0 <= qpsolvers_.DEFAULTS["highs"]["time_limit"] <= 10.0
+    solver = make_solver("highs", time_limit=0.2)
+    solver.setup(program(np.diag([1e12, 1e-12]), [1e6, -1e-6], EYE, [-1e9, -1e9], [1e9, 1e9]))
+    began = time.monotonic()
+    result = solver.solve()
+    assert time.monotonic() - began < 5.0
+    assert result.status is QpStatus.MAX_ITERATIONS
+    assert result.message == "highs: no solution found in 0.2 s"
 
 
 def test_max_iterations_is_a_status() -> None:
