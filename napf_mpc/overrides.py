@@ -59,9 +59,9 @@ def apply_overrides(
         Tables as tomllib gives them. Left as it is.
     overrides : mapping of str to object, or sequence of str
         Key path -> value, or ``"key.path=value"`` lines. Text is read as TOML (:func:`parse_value`); other
-        values are taken as they are. Tables that the file does not have are made; entries of lists must
-        exist. ``planner.k`` takes the file's ``planner.confidence`` out, and the other way round, unless
-        both are set.
+        values are taken as they are, those of NumPy as Python's. Tables that the file does not have are made;
+        entries of lists must exist. ``planner.k`` takes the file's ``planner.confidence`` out, and the other
+        way round, unless both are set.
 
     Returns
     -------
@@ -141,9 +141,10 @@ def _put(data: dict[str, Any], path: tuple[str | int, ...], value: object) -> st
 
 
 def _copied(value: Any) -> Any:
-    """Copy tables and lists (depth is limited by the caller), keep the rest."""
+    """Copy tables and lists (depth is limited by the caller), numbers and arrays of NumPy as Python's own."""
     if isinstance(value, dict):
         return {key: _copied(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
         return [_copied(entry) for entry in value]
-    return value
+    # NumPy itself would double the time that reading a problem takes.
+    return _copied(value.tolist()) if hasattr(value, "tolist") else value

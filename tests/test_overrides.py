@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from napf_mpc.errors import ProblemError
@@ -90,6 +91,26 @@ def test_values_of_python_are_taken_as_they_are() -> None:
         "table1_8", {"planner.k": 2, "world.radius_m": (1.0, 1.5), "title": "3"} | {"title": '"3"'}
     )
     assert (problem.planner.k, problem.world.radius_m, problem.title) == (2.0, (1.0, 1.5), "3")
+
+
+def test_values_of_numpy_are_taken_as_those_of_python() -> None:
+    problem = load_problem(
+        "table1_8",
+        {
+            "planner.horizon": np.int64(10),
+            "planner.k": np.float32(2.0),
+            "world.radius_m": np.array([1.0, 1.5]),
+            "mission.initial_positions_m": np.arange(12.0).reshape(4, 3),
+            "world.count": np.array(3),
+            "mission": {"length_m": np.float64(90.0), "initial_velocities_mps": [np.zeros(3)] * 4},
+        },
+    )
+    assert (problem.planner.horizon, problem.planner.k, problem.world.radius_m) == (10, 2.0, (1.0, 1.5))
+    assert problem.world.count == 3
+    assert problem.mission.length_m == 90.0
+    assert problem.mission.initial_velocities_mps == ((0.0, 0.0, 0.0),) * 4
+    with pytest.raises(ProblemError, match=r"planner\.horizon = 101: must be"):
+        load_problem("table1_8", {"planner.horizon": np.int64(101)})
 
 
 def test_depth_is_measured_without_recursion() -> None:
