@@ -25,6 +25,7 @@ from napf_mpc.words import shown_value
 MAX_RUNS = 10_000_000
 MAX_SEED = 2**63 - 1
 MAX_WORKERS = 1024
+MAX_TICKS = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -97,10 +98,8 @@ def simulate(
     indices = runs if isinstance(runs, range) else range(_checked_count(runs))
     if indices.step != 1 or indices.start < 0 or len(indices) == 0:
         raise ProblemError("simulate", [f"runs = {indices}: must be one or more indices >= 0 without gaps"])
-    if record_every < 0:
-        raise ProblemError("simulate", [f"record_every = {record_every}: must be >= 0"])
     pilot = make_planner(planner, problem) if isinstance(planner, str) else planner
-    check_campaign([pilot.name], indices.stop, seed)
+    check_campaign([pilot.name], indices.stop, seed, record_every=record_every)
     scenario = build_scenario(problem, seed, indices, data_folder)
     return _fly(problem, pilot, scenario, record_every)
 
@@ -250,7 +249,9 @@ def timing_row(planner: str, runs: range, seconds: float) -> store.Columns:
     }
 
 
-def check_campaign(planners: Sequence[str], runs: int, seed: int, workers: int = 1) -> None:
+def check_campaign(
+    planners: Sequence[str], runs: int, seed: int, workers: int = 1, record_every: int = 0
+) -> None:
     """Refuse campaign settings that cannot be meant.
 
     Raises
@@ -263,6 +264,7 @@ def check_campaign(planners: Sequence[str], runs: int, seed: int, workers: int =
         ("runs", runs, 1, MAX_RUNS),
         ("seed", seed, 0, MAX_SEED),
         ("workers", workers, 1, MAX_WORKERS),
+        ("record_every", record_every, 0, MAX_TICKS),
     ):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
             most = "2**63 - 1" if high == MAX_SEED else f"{high}"

@@ -100,7 +100,7 @@ def run_campaign(
     planners: Sequence[str],
     runs: int,
     seed: int,
-    out: Path,
+    out: str | Path,
     *,
     name: str = "problem",
     workers: int = 1,
@@ -123,7 +123,7 @@ def run_campaign(
         Names of planners; all fly the same seeds.
     runs, seed : int
         Number of runs and campaign seed. A later call with more runs flies the missing ones only.
-    out : Path
+    out : str or Path
         Output folder, see :mod:`napf_mpc.campaign_folder`.
     name : str
         Problem's name in the summary.
@@ -161,7 +161,9 @@ def run_campaign(
     OutputError
         If the folder holds other results, is in use, or cannot be written.
     """
-    check_campaign(planners, runs, seed, workers)
+    check_campaign(planners, runs, seed, workers, record_every)
+    # JSON does not take those of NumPy.
+    runs, seed, record_every = int(runs), int(seed), int(record_every)
     if block_limit_s is not None and not 0.0 < block_limit_s < float("inf"):
         raise ProblemError("campaign", [f"block-limit = {shown_value(block_limit_s)}: must be > 0 seconds"])
     scenario = check_flyable(problem, planners, seed, data_folder)
@@ -173,7 +175,7 @@ def run_campaign(
         pool = None
         if cluster is not None:
             pool = stack.enter_context(connected(cluster, origin, problem, data_folder)).flying(fly)
-        stack.enter_context(taken(out, origin))
+        out = stack.enter_context(taken(out, origin))
         blocks = Blocks.of(out, origin)
         blocks.forget_lost()
         finished = [block for block in blocks.finished() if block.start < runs]

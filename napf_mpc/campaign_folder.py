@@ -31,22 +31,27 @@ _WAY_OUT = "delete this file and repeat the command: its runs are flown again"
 
 
 @contextlib.contextmanager
-def taken(path: Path, identity: Mapping[str, Any]) -> Iterator[None]:
+def taken(path: str | Path, identity: Mapping[str, Any]) -> Iterator[Path]:
     """Hold a folder that is empty, or holds earlier results of the same identity.
 
     Parameters
     ----------
-    path : Path
+    path : str or Path
         Folder; made if missing.
     identity : mapping
         Everything that decides the results; kept in ``campaign.json``.
+
+    Yields
+    ------
+    Path
+        The folder.
 
     Raises
     ------
     OutputError
         If it is a file, cannot be written, is in use, or holds anything else.
     """
-    store.output_folder(path)
+    path = store.output_folder(path)
     # A stranger's folder is refused before anything is written into it.
     _refuse_strangers(path)
     with store.locked(path):
@@ -62,7 +67,7 @@ def taken(path: Path, identity: Mapping[str, Any]) -> Iterator[None]:
                 f"{path}: holds results of another origin: {'; '.join(different)}; choose another --out"
             )
         store.remove_partial(path)
-        yield
+        yield path
 
 
 def _refuse_strangers(path: Path) -> None:

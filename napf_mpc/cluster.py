@@ -157,7 +157,8 @@ def connected(
         from distributed import Client
     except ImportError as error:
         raise NapfError(f"{name}: needs the package distributed: pip install 'napf-mpc[cluster]'") from error
-    agree = partial(differing, dict(origin), problem, None if data_folder is None else data_folder.resolve())
+    folder = None if data_folder is None else Path(data_folder).resolve()
+    agree = partial(differing, dict(origin), problem, folder)
     with _quiet(), contextlib.ExitStack() as stack:
         client = _client(Client, address, name)
         stack.callback(_leave, client)

@@ -79,7 +79,7 @@ def fly_mission(
     *,
     seed: int = 0,
     run: int = 0,
-    out: Path | None = None,
+    out: str | Path | None = None,
     data_folder: Path | None = None,
 ) -> FlownMission:
     """Fly one run of a campaign again, or for the first time: the same bits either way.
@@ -94,7 +94,7 @@ def fly_mission(
         Name of the planner.
     seed, run : int
         Campaign seed, and which of its runs.
-    out : Path, optional
+    out : str or Path, optional
         Folder for tables, summary, scenario and the trajectory of every tick; nothing is kept without.
     data_folder : Path, optional
         Where data files lie.
@@ -110,12 +110,13 @@ def fly_mission(
         raise ProblemError(
             "campaign", [f"run-index = {shown_value(run)}: must be a whole number from 0 to {MAX_RUNS - 1}"]
         )
+    run, seed = int(run), int(seed)  # JSON does not take those of NumPy
     origin = identity(problem, name, [planner], seed, data_folder) | {"run": run}
     obstacles = scenes_of(problem, seed, range(run, run + 1), data_folder)
     moving = moving_of(problem, seed, range(run, run + 1))
     if out is None:
         return _flown(_fly(problem, planner, seed, run, obstacles, data_folder), origin, obstacles, moving)
-    with taken(out, origin):
+    with taken(out, origin) as out:
         block = _fly(problem, planner, seed, run, obstacles, data_folder)
         mission = _flown(block, origin, obstacles, moving)
         store.write_table(out / "runs.parquet", block.rows)

@@ -198,7 +198,7 @@ def stack(tables: Sequence[Mapping[str, Column]]) -> Columns:
     return {name: np.concatenate([np.asarray(table[name]) for table in tables]) for name in tables[0]}
 
 
-def output_folder(path: Path) -> Path:
+def output_folder(path: str | Path) -> Path:
     """Make a folder for results.
 
     Raises
@@ -207,7 +207,10 @@ def output_folder(path: Path) -> Path:
         If it cannot be made, cannot be written or is a file.
     """
     try:
+        path = Path(path)
         path.mkdir(parents=True, exist_ok=True)
+    except TypeError as error:
+        raise OutputError(f"out = {path!r}: is not the path of a folder") from error
     except FileExistsError as error:
         raise OutputError(f"{path}: is a file, not a folder; choose another --out") from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name

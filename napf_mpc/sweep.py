@@ -157,7 +157,7 @@ def run_sweep(
     planners: Sequence[str],
     runs: int,
     seed: int,
-    out: Path,
+    out: str | Path,
     *,
     name: str = "problem",
     workers: int = 1,
@@ -174,7 +174,7 @@ def run_sweep(
         Names of planners; all fly the same seeds at every point.
     runs, seed : int
         Number of runs of each point, and campaign seed.
-    out : Path
+    out : str or Path
         Output folder: a campaign's folder for each point, ``sweep.parquet`` and ``sweep.csv``. Another grid
         over the same problem may go into the same folder; what it shares is not flown again.
     name : str
@@ -200,7 +200,7 @@ def run_sweep(
     check_points(points, planners, seed, data_folder)
     origin = {"sweep": name, "seed": int(seed), "planners": list(planners), "versions": versions()}
     rows: list[dict[str, Any]] = []
-    with taken(out, origin):
+    with taken(out, origin) as out:
         for number, point in enumerate(points):
 
             def tell(done: int, before: int = number * runs) -> None:

@@ -15,9 +15,11 @@ from napf_mpc.block import MAX_RUNS, MAX_SEED, Block, check_campaign, fly_block,
 from napf_mpc.campaign import block_size, check_flyable, chunks, compare, run_campaign
 from napf_mpc.errors import DataError, NapfError, OutputError, ProblemError, SceneError
 from napf_mpc.evaluate import METRICS, Outcome
+from napf_mpc.mission import fly_mission
 from napf_mpc.prefix import Prefix, looks
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
+from napf_mpc.sweep import Point, run_sweep
 
 BRIEF: dict[str, Any] = {
     "mission": {"length_m": 1.0, "initial_velocities_mps": [[2.0, 0.0, 0.0]] * 4},
@@ -585,6 +587,33 @@ def test_settings_that_cannot_be_meant_are_refused(
     with pytest.raises(ProblemError) as caught:
         check_campaign(planners, runs, seed, workers)
     assert told in str(caught.value)
+
+
+@pytest.mark.parametrize("every", [-1, 1.5, True, "1", None])
+def test_ticks_that_are_none_are_refused_wherever_they_are_given(every: Any, tmp_path: Path) -> None:
+    with pytest.raises(ProblemError, match=r"record_every = .*: must be a whole number from 0 to"):
+        run_campaign(brief(), ["apf"], 1, 0, tmp_path / "out", record_every=every)
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(ProblemError, match=r"record_every = .*: must be a whole number from 0 to"):
+        simulate(brief(), "apf", record_every=every)
+
+
+def test_folders_may_be_texts_and_numbers_those_of_numpy(tmp_path: Path) -> None:
+    whole: Any = np.int64(2)
+    run_campaign(
+        brief(), ["apf"], whole, np.int64(7), str(tmp_path / "a"), record_every=whole, enough=lambda _: False
+    )
+    run_campaign(brief(), ["apf"], 2, 7, tmp_path / "b", record_every=2)
+    assert digest(tmp_path / "a") == digest(tmp_path / "b")
+    fly_mission(brief(), "brief", "apf", seed=np.int64(7), run=np.int64(1), out=str(tmp_path / "c"))
+    points = [Point({"planner.k": "1"}, brief())]
+    assert len(run_sweep(points, ["apf"], 1, 7, str(tmp_path / "d"))["runs"]) == 1
+
+
+@pytest.mark.parametrize("out", [None, 5])
+def test_what_is_no_folder_is_refused(out: Any) -> None:
+    with pytest.raises(OutputError, match=f"out = {out}: is not the path of a folder"):
+        run_campaign(brief(), ["apf"], 1, 0, out)
 
 
 def test_a_seed_of_thousands_of_digits_is_refused_in_few_words() -> None:

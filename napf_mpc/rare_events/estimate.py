@@ -93,7 +93,7 @@ def estimate_collision_risk(
             ],
         )
     origin = identity(problem, name, [planner], seed, data_folder) | {"rare": {"samples": samples}}
-    with taken(out, origin):
+    with taken(out, origin) as out:
         calls = _Calls(limit, store.output_folder(out / "calls"), progress)
         store.remove_partial(calls.folder)
         result = subset_simulation(calls, limit.dimension, seed=seed, samples=samples)
