@@ -36,7 +36,7 @@ from napf_mpc.navigation.monitor import Monitor
 from napf_mpc.navigation.sigma_map import SigmaMap
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import MovingTracker
-from napf_mpc.planners.planner import Command, Planner
+from napf_mpc.planners.planner import Command, Planner, check_command
 from napf_mpc.problem import FormationMission, Gnss, Problem
 from napf_mpc.streams import Seed
 from napf_mpc.vehicle.lqr import check_sampled_loop
@@ -248,6 +248,7 @@ def closed_loop(
             tracks = None if tracker is None else tracker.tracks()
             shown = replace(nav, airborne=airborne, tracks=tracks, sigma_map=scenario.sigma_map)
             command = planner.step(shown, time_s)
+            check_command(command, planner.name, (runs, state.shape[1]))
             holding[active] = command.holding[active].any(-1)
             if command.reason is not None:
                 reason[active] = command.reason[active].max(-1)

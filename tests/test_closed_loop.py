@@ -1,6 +1,6 @@
 """The closed loop: take-off into formation, independence of runs, clocks, and runs that break."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -340,6 +340,60 @@ def test_a_run_with_a_number_that_is_not_finite_has_failed_and_no_other(value: f
         for name in METRICS:
             np.testing.assert_array_equal(score.metrics[name][run], good.metrics[name][run], err_msg=name)
     assert sum(score.outcome.count(outcome) for outcome in Outcome) == 5
+
+
+@dataclass
+class Misshapen:
+    """Planner whose commands have one field of another form."""
+
+    inner: NapfPlanner
+    change: Callable[[Command], Any]
+    name: str = "mine"
+
+    def reset(self, obstacles: ObstacleSet, runs: int) -> None:
+        self.inner.reset(obstacles, runs)
+
+    def step(self, nav: NavSolution, time_s: float) -> Any:
+        return self.change(self.inner.step(nav, time_s))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda c: replace(c, yaw=0.0), "yaw is a float, must be an array (run, uav) = (2, 4)"),
+        (lambda c: replace(c, yaw=np.zeros(4)), "yaw has shape (4,), must be (run, uav) = (2, 4)"),
+        (lambda c: replace(c, feedforward=None), "feedforward is a NoneType, must be an array (run, uav, 4)"),
+        (lambda c: replace(c, position=c.position.tolist()), "position is a list, must be an array"),
+        (lambda c: replace(c, velocity=c.velocity[0]), "velocity has shape (4, 3), must be (run, uav, 3)"),
+        (lambda c: replace(c, direction=c.direction[..., :2]), "direction has shape (2, 4, 2), must be"),
+        (lambda c: replace(c, holding=c.holding.tolist()), "holding is a list, must be an array (run, uav)"),
+        (lambda c: replace(c, holding=c.holding[0]), "holding has shape (4,), must be (run, uav) = (2, 4)"),
+        (lambda c: replace(c, reason=np.zeros(2, np.int8)), "reason has shape (2,), must be (run, uav)"),
+        (lambda c: replace(c, planned=[True]), "planned is a list, must be an array (run, uav)"),
+        (lambda c: replace(c, slack_m=0.0), "slack_m is a float, must be an array (run, uav)"),
+        (lambda c: replace(c, solver_status="solved"), "solver_status is a str, must be an array (run, uav)"),
+        (lambda c: replace(c, plan=c.position), "plan is a ndarray, must be a Plan of (run, uav) = (2, 4)"),
+        (lambda c: None, "step() returned a NoneType, must return a Command"),
+        (lambda c: (c.position, c.velocity), "step() returned a tuple, must return a Command"),
+    ],
+)
+def test_a_command_of_another_form_is_refused_by_planner_and_field(
+    change: Callable[[Command], Any], told: str
+) -> None:
+    problem = short("lanes")
+    with pytest.raises(ProblemError) as caught:
+        closed_loop(problem, Misshapen(NapfPlanner(problem), change), build_scenario(problem, 4, range(2)))
+    assert caught.value.source == 'planner "mine"'
+    assert len(caught.value.problems) == 1
+    assert told in caught.value.problems[0]
+
+
+def test_all_fields_that_do_not_fit_are_told_at_once() -> None:
+    problem = short("lanes")
+    planner = Misshapen(NapfPlanner(problem), lambda c: replace(c, yaw=0.0, holding=None))
+    with pytest.raises(ProblemError) as caught:
+        closed_loop(problem, planner, build_scenario(problem, 4, range(2)))
+    assert [line.split()[0] for line in caught.value.problems] == ["yaw", "holding"]
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
@@ -9,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from napf_mpc.errors import ProblemError
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.plan import Plan
 from napf_mpc.planners.tally import Tally
@@ -67,6 +69,62 @@ class Command:
     """(run, uav) most that the flown plan is inside an obstacle's margin [m]."""
     solver_status: NDArray[np.str_] | None = None
     """(run, uav) word of the solver for this step's program."""
+
+
+_FIELDS = (
+    *((name, (3,)) for name in ("position", "velocity", "direction")),
+    *((name, ()) for name in ("yaw", "holding")),
+    ("feedforward", (4,)),
+)
+"""Arrays of a command and their axes after (run, uav)."""
+_OPTIONAL = ("planned", "reason", "slack_m", "solver_status")
+"""Arrays (run, uav) of a command that may be None."""
+
+
+def check_command(command: Command, planner: str, shape: tuple[int, int]) -> None:
+    """Refuse what is no command for UAVs of shape (run, uav).
+
+    Raises
+    ------
+    ProblemError
+        Naming the planner and every field that does not fit.
+    """
+    try:
+        vector = (*shape, 3)
+        if (
+            command.position.shape == vector
+            and command.velocity.shape == vector
+            and command.direction.shape == vector
+            and command.yaw.shape == shape
+            and command.holding.shape == shape
+            and command.feedforward.shape == (*shape, 4)
+            and (command.planned is None or command.planned.shape == shape)
+            and (command.reason is None or command.reason.shape == shape)
+            and (command.slack_m is None or command.slack_m.shape == shape)
+            and (command.solver_status is None or command.solver_status.shape == shape)
+            and (command.plan is None or command.plan.initial.shape[:2] == shape)
+        ):
+            return
+    except AttributeError:
+        pass  # of something that is no array: it is named below
+    raise ProblemError(f'planner "{planner}"', [*_command_faults(command, shape)])
+
+
+def _command_faults(command: Command, shape: tuple[int, int]) -> Iterator[str]:
+    if not isinstance(command, Command):
+        yield f"step() returned a {type(command).__name__}, must return a Command"
+        return
+    optional = [(name, ()) for name in _OPTIONAL if getattr(command, name) is not None]
+    for name, axes in (*_FIELDS, *optional):
+        values, want = getattr(command, name), (*shape, *axes)
+        words = f"(run, uav{''.join(f', {n}' for n in axes)}) = {want}"
+        if not isinstance(values, np.ndarray):
+            yield f"{name} is a {type(values).__name__}, must be an array {words}"
+        elif values.shape != want:
+            yield f"{name} has shape {values.shape}, must be {words}"
+    plan = command.plan
+    if plan is not None and not (isinstance(plan, Plan) and plan.initial.shape[:2] == shape):
+        yield f"plan is a {type(plan).__name__}, must be a Plan of (run, uav) = {shape}"
 
 
 class Planner(Protocol):
