@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -26,6 +26,8 @@ SIGNALS: dict[str, tuple[int, ...]] = {
     "input": (0, 1, 2, 3),
 }
 """Name of a signal -> its places in the state (Eq. 1), or in the input about hover (Eq. 2)."""
+_REAL = "biuf"
+"""Kinds of entries that are real numbers."""
 
 
 class ConstraintError(NapfError, ValueError):
@@ -171,8 +173,8 @@ class LinearRows:
     """Rows ``lower <= jac . signal <= upper`` of every run, UAV and stage, hard or soft.
 
     A soft row may be violated by a slack s >= 0 in its own unit at the price of
-    ``w1 s + w2 s^2 / 2`` per second. The number of rows is the same every step; an inactive row carries
-    infinite bounds.
+    ``w1 s + w2 s^2 / 2`` per second. The number of rows is to be the same every step (one that changes costs
+    the solver its guess); an inactive row carries infinite bounds.
     """
 
     signal: str
@@ -245,26 +247,25 @@ class LinearRows:
         ConstraintError
             Naming everything that is wrong.
         """
-        faults = [*self._shape_faults(shape)]
-        if not faults:
-            faults = [*self._value_faults()]
+        self.check_shapes(shape)
+        faults = [*self._value_faults()]
         if faults:
             raise ConstraintError("; ".join(faults))
 
-    def check_shapes(self, shape: tuple[int, int, int], name: str) -> None:
-        """Refuse rows of a named constraint whose arrays do not fit a horizon of shape (run, uav, N).
+    def check_shapes(self, shape: tuple[int, int, int]) -> None:
+        """Refuse rows whose arrays do not fit a horizon of shape (run, uav, N), without a look into them.
 
         Raises
         ------
         ConstraintError
-            Naming the constraint and everything that does not fit.
+            Naming everything that does not fit.
         """
         faults = [*self._shape_faults(shape)]
         if faults:
-            raise ConstraintError(f"constraint {name!r}: {'; '.join(faults)}")
+            raise ConstraintError("; ".join(faults))
 
     def outline(self) -> Hashable:
-        """All that shapes and kind of the rows are; it never changes from step to step."""
+        """All that shapes and kind of the rows are."""
         return (
             self.signal, self.shared_slack, self.jac.shape,
             None if self.lower is None else self.lower.shape,
@@ -274,9 +275,14 @@ class LinearRows:
         )  # fmt: skip
 
     def _shape_faults(self, shape: tuple[int, int, int]) -> Iterator[str]:
-        if self.signal not in SIGNALS:
+        if not (isinstance(self.signal, str) and self.signal in SIGNALS):
             yield f"signal {self.signal!r} is not known; choose from {', '.join(SIGNALS)}"
             return
+        if not isinstance(self.jac, np.ndarray):
+            yield f"jac is a {type(self.jac).__name__}, must be an array (run, uav, N, m, dim)"
+            return
+        if self.jac.dtype.kind not in _REAL:
+            yield f"jac holds entries of type {self.jac.dtype}, must hold real numbers"
         want = (*shape, self.jac.shape[3] if self.jac.ndim == 5 else -1)
         if self.jac.shape != (*want, len(SIGNALS[self.signal])):
             dims = (*shape, "m", len(SIGNALS[self.signal]))
@@ -289,8 +295,14 @@ class LinearRows:
             ("w2", self.w2, slack),
         )
         for name, values, expected in arrays:
-            if values is not None and values.shape != expected:
+            if values is None:
+                continue
+            if not isinstance(values, np.ndarray):
+                yield f"{name} is a {type(values).__name__}, must be an array (run, uav, N, m) = {expected}"
+            elif values.shape != expected:
                 yield f"{name} has shape {values.shape}, must be {expected}"
+            elif values.dtype.kind not in _REAL:
+                yield f"{name} holds entries of type {values.dtype}, must hold real numbers"
         if (self.w1 is None) != (self.w2 is None):
             yield "give both of w1 and w2 (soft rows) or neither (hard rows)"
         if self.shared_slack and not self.soft:
@@ -331,3 +343,61 @@ class Constraint(Protocol):
     def rows(self, horizon: Horizon) -> LinearRows:
         """Rows of all runs, UAVs and stages; called once a step. Signal, shapes and kind never change."""
         ...
+
+
+def checked_constraints(constraints: object) -> list[Constraint]:
+    """List of constraints.
+
+    Raises
+    ------
+    ConstraintError
+        Naming what is none.
+    """
+    if not isinstance(constraints, Iterable):
+        raise ConstraintError(f"constraints is a {type(constraints).__name__}, must be a list of constraints")
+    held = list(constraints)
+    faults = [fault for constraint in held for fault in _constraint_faults(constraint)]
+    if faults:
+        raise ConstraintError("\n".join(faults))
+    return held
+
+
+def _constraint_faults(constraint: object) -> Iterator[str]:
+    if isinstance(constraint, type):
+        yield f"{constraint.__name__}: is a class, give an instance of it: {constraint.__name__}(...)"
+        return
+    kind, name = type(constraint).__name__, getattr(constraint, "name", None)
+    if not (isinstance(name, str) and name):
+        yield f"{kind}: name must be a text that is not empty"
+    if not callable(getattr(constraint, "rows", None)):
+        yield f"{kind}: rows must be a method that takes a horizon"
+
+
+def checked_rows(rows: object) -> LinearRows:
+    """What rows() of a constraint has returned.
+
+    Raises
+    ------
+    ConstraintError
+        If it is something else.
+    """
+    if not isinstance(rows, LinearRows):
+        raise ConstraintError(f"rows() returned a {type(rows).__name__}, must return LinearRows")
+    return rows
+
+
+def check_outlines(
+    constraints: Iterable[Constraint], blocks: Iterable[object], shape: tuple[int, int, int]
+) -> None:
+    """Refuse rows of constraints whose arrays do not fit a horizon of shape (run, uav, N).
+
+    Raises
+    ------
+    ConstraintError
+        Naming the constraint and everything that does not fit.
+    """
+    for constraint, block in zip(constraints, blocks, strict=True):
+        try:
+            checked_rows(block).check_shapes(shape)
+        except ConstraintError as error:
+            raise ConstraintError(f"constraint {constraint.name!r}: {error}") from error

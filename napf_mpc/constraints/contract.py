@@ -12,7 +12,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from napf_mpc.constraints.constraint import Constraint, ConstraintError, Horizon, LinearRows
+from napf_mpc.constraints.constraint import (
+    Constraint,
+    ConstraintError,
+    Horizon,
+    LinearRows,
+    checked_constraints,
+    checked_rows,
+)
 from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.navigation.tracks import Tracks
 from napf_mpc.problem import FormationMission, Problem
@@ -162,9 +169,8 @@ def check_constraint(
     ConstraintError
         Naming everything that is wrong and the horizon's place in the sequence.
     """
+    checked_constraints([constraint])
     faults = []
-    if not (isinstance(constraint.name, str) and constraint.name):
-        faults.append("name must be a text that is not empty")
     kinds: dict[tuple[object, ...], int] = {}
     steady: list[tuple[int, LinearRows, list[Array]]] = []
     for i, horizon in enumerate(sample_horizons() if horizons is None else horizons):
@@ -174,7 +180,7 @@ def check_constraint(
         if any(not np.array_equal(a, b) for a, b in zip(before, _arrays(horizon), strict=True)):
             faults.append(f"horizon {i}: rows() changed the horizon")
         try:
-            rows.check(horizon.shape)
+            checked_rows(rows).check(horizon.shape)
         except ConstraintError as error:
             faults.append(f"horizon {i}: {error}")
             continue
@@ -253,6 +259,8 @@ def _part(rows: LinearRows, run: int, uavs: slice) -> LinearRows:
 
 
 def _same(a: LinearRows, b: LinearRows) -> bool:
+    if not isinstance(b, LinearRows):
+        return False
     pairs = ((a.jac, b.jac), (a.lower, b.lower), (a.upper, b.upper), (a.w1, b.w1), (a.w2, b.w2))
     return a.signal == b.signal and all(
         x is y if x is None or y is None else np.array_equal(x, y) for x, y in pairs

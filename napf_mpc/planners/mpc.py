@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
-from napf_mpc.constraints.constraint import Constraint, Horizon, LinearRows
+from napf_mpc.constraints.constraint import (
+    Constraint,
+    Horizon,
+    LinearRows,
+    check_outlines,
+    checked_constraints,
+)
 from napf_mpc.constraints.limits import AltitudeBand, InputBox, SpeedLimit, TiltLimit
 from napf_mpc.constraints.moving import MovingObstacleContact
 from napf_mpc.constraints.neighbours import NeighbourSeparation, ShortMargins
@@ -164,7 +170,9 @@ class QpPlanner:
             raise ProblemError("mission.kind", ['must be "formation" for this planner, not "goal"'])
         settings = problem.planner
         self.problem = problem
-        self.constraints = list(default_constraints(problem) if constraints is None else constraints)
+        self.constraints = checked_constraints(
+            default_constraints(problem) if constraints is None else constraints
+        )
         self._name = name
         self._clock = clock
         self._frame = PathFrame.of_mission(problem.mission)
@@ -438,11 +446,14 @@ class QpPlanner:
     def _programs(self, state: Array, origin: Array, reference: Array, horizon: Horizon) -> HorizonQp:
         """Programs with each UAV's place as the origin: large coordinates would cost digits."""
         blocks: list[LinearRows] = [constraint.rows(horizon) for constraint in self.constraints]
-        outlines = [horizon.shape, *[block.outline() for block in blocks]]
-        if outlines != self._outlines:
-            for constraint, block in zip(self.constraints, blocks, strict=True):
-                block.check_shapes(horizon.shape, constraint.name)
+        try:
+            outlines: list[Hashable] = [horizon.shape, *[block.outline() for block in blocks]]
+        except AttributeError:  # of what are no rows, or no arrays
+            outlines = []
+        if not outlines or outlines != self._outlines:
+            check_outlines(self.constraints, blocks, horizon.shape)
             self._outlines = outlines
+            self._answer = None  # it answers other rows, and is no guess
         blocks = [block.shifted(origin) if block.signal == "position" else block for block in blocks]
         initial = _moved(state[:, :, None], origin, -1.0)[:, :, 0]
         return HorizonQp(self._model, initial, _moved(reference, origin, -1.0), tuple(blocks))
@@ -468,8 +479,10 @@ class QpPlanner:
                 inputs = np.where(better, answer.inputs, inputs)
             self._last_horizon = self._horizon(states, covariance, nav, trusted, time_s)
             programs = self._programs(state, origin, reference, self._last_horizon)
-            warm = None if answer is None else answer.warm_start(_moved(states, origin, -1.0), inputs)
-            answer = self._answer_to(programs, warm, asked)
+            warm = None
+            if self._answer is not None:
+                warm = self._answer.warm_start(_moved(states, origin, -1.0), inputs)
+            self._answer = answer = self._answer_to(programs, warm, asked)
             if turn + 1 < self.problem.planner.passes:
                 # The last pass is counted with what becomes of it.
                 passes.count_solves(

@@ -62,6 +62,13 @@ def test_good_rows_pass_soft_hard_shared_and_one_sided() -> None:
         ({"w1": np.full((*SHAPE, 2), -1.0)}, "w1 has an entry"),
         ({"w2": np.full((*SHAPE, 2), np.inf)}, "w2 has an entry"),
         ({"w1": np.zeros((*SHAPE, 2)), "w2": np.zeros((*SHAPE, 2))}, "free of charge"),
+        ({"signal": ["velocity"]}, "signal .'velocity'. is not known"),
+        ({"jac": rows().jac.tolist()}, r"jac is a list, must be an array \(run, uav, N, m, dim\)"),
+        ({"lower": -7.0}, r"lower is a float, must be an array \(run, uav, N, m\) = \(2, 3, 4, 2\)"),
+        ({"upper": np.float64(7.0)}, "upper is a float64, must be an array"),
+        ({"w1": 300.0, "w2": 300.0}, "w1 is a float, must be an array.*w2 is a float"),
+        ({"jac": rows().jac.astype(object)}, "jac holds entries of type object, must hold real numbers"),
+        ({"lower": 1j * np.ones((*SHAPE, 2))}, "lower holds entries of type complex128"),
     ],
 )
 def test_bad_rows_are_refused_by_name(changes: dict[str, Any], fault: str) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -128,6 +129,43 @@ def test_rows_that_couple_uavs_pass_when_they_say_so() -> None:
 def test_a_constraint_has_a_name() -> None:
     with pytest.raises(ConstraintError, match="name"):
         check_constraint(Own(ceiling, name=""))
+
+
+def scalar_bounds(horizon: Horizon) -> LinearRows:
+    scalars: Any = -7.0, 7.0, 300.0, 300.0
+    return LinearRows("position", ceiling(horizon).jac, *scalars)
+
+
+def sometimes_nothing(horizon: Horizon) -> Any:
+    return ceiling(horizon) if horizon.shape[0] > 1 else None
+
+
+class Nameless:
+    def rows(self, horizon: Horizon) -> LinearRows:
+        return ceiling(horizon)
+
+
+class Rowless:
+    name = "rowless"
+
+
+@pytest.mark.parametrize(
+    ("constraint", "fault"),
+    [
+        (Own(scalar_bounds), r"own: horizon 0: lower is a float, must be an array \(run, uav, N, m\)"),
+        (Own(lambda horizon: None), "own: horizon 0: rows.. returned a NoneType, must return LinearRows"),
+        (Own(lambda horizon: [ceiling(horizon)]), "own: horizon 0: rows.. returned a list, must return"),
+        (Own(sometimes_nothing), "own: horizon 0: run 0 alone gives other rows"),
+        (Nameless(), "Nameless: name must be a text that is not empty"),
+        (Own(ceiling, name=3), "Own: name must be a text"),
+        (Rowless(), "Rowless: rows must be a method that takes a horizon"),
+        (Own, r"Own: is a class, give an instance of it: Own\(...\)"),
+        (ceiling, "function: name must be a text.*\n.*rows must be a method"),
+    ],
+)
+def test_what_is_no_constraint_is_refused_in_words(constraint: Any, fault: str) -> None:
+    with pytest.raises(ConstraintError, match=fault):
+        check_constraint(constraint)
 
 
 def test_samples_are_valid_repeatable_and_varied() -> None:

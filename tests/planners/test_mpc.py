@@ -12,7 +12,7 @@ import pytest
 
 from napf_mpc.block import simulate
 from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
-from napf_mpc.constraints.constraint import Horizon, LinearRows
+from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, TiltLimit
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.navigation.solution import NavSolution
@@ -535,6 +535,70 @@ def test_rows_that_fit_at_first_and_then_no_more_are_an_error_too() -> None:
         planner.step(nav(on_slots(planner)), time_s)
     with pytest.raises(NapfError, match="constraint 'shrinks': jac has shape"):
         planner.step(nav(on_slots(planner)), 0.2)
+
+
+@pytest.mark.parametrize(
+    ("returned", "told"),
+    [
+        (None, "rows.. returned a NoneType, must return LinearRows"),
+        ([], "rows.. returned a list, must return LinearRows"),
+        (LinearRows("position", np.zeros((1, 4, 20, 1, 3)), -7.0, 7.0, 300.0, 300.0),  # type: ignore[arg-type]
+         r"lower is a float, must be an array \(run, uav, N, m\) = \(1, 4, 20, 1\)"),
+        (LinearRows("position", [[0.0, 0.0, 1.0]]), "jac is a list, must be an array"),  # type: ignore[arg-type]
+    ],
+)  # fmt: skip
+def test_what_are_no_rows_is_an_error_that_names_the_constraint(returned: object, told: str) -> None:
+    class Own:
+        name = "own"
+
+        def rows(self, horizon: Horizon) -> Any:
+            return returned
+
+    planner = QpPlanner(problem(), constraints=[Own()])
+    planner.reset(ObstacleSet.empty(), 1)
+    with pytest.raises(ConstraintError, match=f"constraint 'own': {told}"):
+        planner.step(nav(on_slots(planner)), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("constraints", "told"),
+    [
+        ([TiltLimit], r"TiltLimit: is a class, give an instance of it: TiltLimit\(...\)"),
+        ([object()], "object: name must be a text"),
+        (TiltLimit(), "constraints is a TiltLimit, must be a list of constraints"),
+    ],
+)
+def test_what_is_no_constraint_is_refused_when_the_planner_is_made(constraints: Any, told: str) -> None:
+    with pytest.raises(ConstraintError, match=told):
+        QpPlanner(problem(), constraints=constraints)
+
+
+@pytest.mark.parametrize("passes", [1, 2])
+@pytest.mark.parametrize("solver", ["kernel", "osqp"])
+def test_a_count_of_rows_that_changes_is_flown_from_a_cold_start(solver: str, passes: int) -> None:
+    class Growing:
+        """A ceiling 2 m below the lanes, told once in the first step, twice in the second, then once."""
+
+        name, asked = "growing", 0
+
+        def rows(self, horizon: Horizon) -> LinearRows:
+            self.asked += 1
+            shape = (*horizon.shape, 2 if self.asked in (2, 3) else 1)
+            jac = np.broadcast_to([0.0, 0.0, 1.0], (*shape, 3))
+            price = np.full(shape, 1000.0)
+            return LinearRows("position", jac, None, np.full(shape, -2.0), price, price)
+
+    asked = problem(planner={"kind": "qp", "passes": passes})
+    planner = QpPlanner(asked, [*default_constraints(asked), Growing()], solver)
+    planner.reset(ObstacleSet.empty(), 1)
+    solution = nav(on_slots(planner), cruising(planner))
+    for step in range(4):
+        command = planner.step(solution, 0.1 * step)
+        assert command.plan is not None
+        assert command.planned is not None
+        assert command.planned.all()
+        np.testing.assert_allclose(command.plan.states[..., -1, 4], -2.0, atol=0.02)
+        solution = followed(solution, command, 0.1 * (step + 1))
 
 
 def test_a_walk_to_a_goal_is_not_flown() -> None:
