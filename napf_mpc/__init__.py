@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from napf_mpc.planners.mpc import QpPlanner
     from napf_mpc.planners.planner import Command, Planner
     from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner
+    from napf_mpc.planners.registry import register_planner
     from napf_mpc.problem import Problem
     from napf_mpc.problem_file import load_problem
     from napf_mpc.safety_distance import clearance_margin
@@ -49,6 +50,7 @@ _HOMES = {
     "linearize": "vehicle.quadrotor",
     "load_problem": "problem_file",
     "lqr": "vehicle.lqr",
+    "register_planner": "planners.registry",
     "register_solver": "solvers.solver",
     "run_campaign": "campaign",
     "simulate": "block",
@@ -77,6 +79,7 @@ __all__ = [
     "linearize",
     "load_problem",
     "lqr",
+    "register_planner",
     "register_solver",
     "run_campaign",
     "simulate",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,8 +15,8 @@ from napf_mpc.closed_loop import Scenario, build_scenario, closed_loop
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
 from napf_mpc.navigation.monitor import DoubtEvent, MonitorEvent
-from napf_mpc.planners.planner import Planner, tally_of
-from napf_mpc.planners.registry import make_planner
+from napf_mpc.planners.planner import Planner, planner_fault, tally_of
+from napf_mpc.planners.registry import NAME_IT, Factory, make_planner
 from napf_mpc.planners.tally import Event, Tally
 from napf_mpc.problem import Problem
 from napf_mpc.record import TrajectoryRecorder
@@ -75,7 +75,7 @@ def simulate(
     problem : Problem
         Formation problem, see :func:`napf_mpc.load_problem`.
     planner : str or Planner
-        Name, or a planner of your own.
+        Name, shipped or of :func:`napf_mpc.register_planner`, or a planner of your own.
     seed : int
         Campaign seed, 0 <= seed < 2**63.
     runs : int or range
@@ -99,9 +99,12 @@ def simulate(
     if indices.step != 1 or indices.start < 0 or len(indices) == 0:
         raise ProblemError("simulate", [f"runs = {indices}: must be one or more indices >= 0 without gaps"])
     pilot = make_planner(planner, problem) if isinstance(planner, str) else planner
-    check_campaign([pilot.name], indices.stop, seed, record_every=record_every)
+    if fault := planner_fault(pilot):
+        raise ProblemError("planner", [fault])
+    name = planner if isinstance(planner, str) else pilot.name
+    check_campaign([name], indices.stop, seed, record_every=record_every)
     scenario = build_scenario(problem, seed, indices, data_folder)
-    return _fly(problem, pilot, scenario, record_every)
+    return _fly(problem, name, pilot, scenario, record_every)
 
 
 def _checked_count(runs: int) -> int:
@@ -116,6 +119,7 @@ def fly_block(
     runs: range,
     data_folder: Path | None = None,
     record_every: int = 0,
+    own: Mapping[str, Factory] | None = None,
 ) -> Block:
     """Fly some runs of a campaign with every planner, on the same scenes and errors.
 
@@ -133,6 +137,9 @@ def fly_block(
         Where data files lie.
     record_every : int
         Keep every n-th tick of the trajectories; 0 for none.
+    own : mapping of str to callable, optional
+        Registered planners, where they are not this process's; see
+        :func:`napf_mpc.planners.registry.make_planner`.
 
     Returns
     -------
@@ -150,7 +157,7 @@ def fly_block(
         rows, timing, trajectories, events = [], [], [], []
         for name in planners:
             began = time.perf_counter()
-            flown = _fly(problem, make_planner(name, problem), scenario, record_every)
+            flown = _fly(problem, name, make_planner(name, problem, own), scenario, record_every)
             timing.append(timing_row(name, runs, time.perf_counter() - began))
             rows.append(score_rows(name, seed, flown.score, flown.tally))
             events.append(flown.tally.event_columns(name, runs.start))
@@ -159,9 +166,9 @@ def fly_block(
     return Block(store.stack(rows), store.stack(timing), store.stack(trajectories), store.stack(events))
 
 
-def _fly(problem: Problem, planner: Planner, scenario: Scenario, record_every: int) -> Missions:
+def _fly(problem: Problem, name: str, planner: Planner, scenario: Scenario, record_every: int) -> Missions:
     judge = MissionScore(problem, scenario)
-    recorder = TrajectoryRecorder(planner.name, scenario.runs, record_every) if record_every else None
+    recorder = TrajectoryRecorder(name, scenario.runs, record_every) if record_every else None
     flight = closed_loop(problem, planner, scenario, (judge,) if recorder is None else (judge, recorder))
     track = {} if recorder is None else recorder.columns()
     tally = tally_of(planner, len(scenario.runs))
@@ -269,9 +276,19 @@ def check_campaign(
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
             most = "2**63 - 1" if high == MAX_SEED else f"{high}"
             faults.append(f"{name} = {shown_value(value)}: must be a whole number from {low} to {most}")
-    if isinstance(planners, str) or not planners:
+    if isinstance(planners, str):
         faults.append("planners: give a list of at least one name")
+    elif not isinstance(planners, Collection):
+        faults.append(f"planners is {_described(planners)}, not a list of names: {NAME_IT}")
+    elif not len(planners):
+        faults.append("planners: give a list of at least one name")
+    elif others := [(i, planner) for i, planner in enumerate(planners) if not isinstance(planner, str)]:
+        faults += [f"planners[{i}] is {_described(other)}, not a name: {NAME_IT}" for i, other in others]
     elif len(set(planners)) != len(planners):
         faults.append(f"planners = {','.join(planners)[:200]}: each may be named once")
     if faults:
         raise ProblemError("campaign", faults)
+
+
+def _described(thing: object) -> str:
+    return f"the class {thing.__name__}" if isinstance(thing, type) else f"a {type(thing).__name__}"

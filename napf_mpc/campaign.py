@@ -19,7 +19,7 @@ from napf_mpc.closed_loop import Scenario, build_scenario
 from napf_mpc.cluster import connected
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import Outcome
-from napf_mpc.planners.registry import make_planner
+from napf_mpc.planners.registry import make_planner, own_planners
 from napf_mpc.prefix import Prefix
 from napf_mpc.problem import Problem
 from napf_mpc.provenance import identity, versions
@@ -71,7 +71,7 @@ def compare(
     problem : Problem
         Formation problem.
     planners : sequence of str
-        Names of planners.
+        Names of planners, shipped or registered.
     runs, seed : int
         Number of runs and campaign seed.
     data_folder : Path, optional
@@ -120,7 +120,7 @@ def run_campaign(
     problem : Problem
         Formation problem.
     planners : sequence of str
-        Names of planners; all fly the same seeds.
+        Names of planners, shipped or registered; all fly the same seeds.
     runs, seed : int
         Number of runs and campaign seed. A later call with more runs flies the missing ones only.
     out : str or Path
@@ -128,7 +128,7 @@ def run_campaign(
     name : str
         Problem's name in the summary.
     workers : int
-        Processes.
+        Processes; they are sent the planners of :func:`~napf_mpc.planners.registry.register_planner`.
     block_runs : int, optional
         Runs flown in lock-step; changes no result.
     data_folder : Path, optional
@@ -168,13 +168,14 @@ def run_campaign(
         raise ProblemError("campaign", [f"block-limit = {shown_value(block_limit_s)}: must be > 0 seconds"])
     scenario = check_flyable(problem, planners, seed, data_folder)
     origin = identity(problem, name, planners, seed, data_folder) | {"record_every": record_every}
+    own = own_planners(planners)
     fly = partial(
-        fly_block, problem, tuple(planners), seed, data_folder=data_folder, record_every=record_every
+        fly_block, problem, tuple(planners), seed, data_folder=data_folder, record_every=record_every, own=own
     )
     with contextlib.ExitStack() as stack:
         pool = None
         if cluster is not None:
-            pool = stack.enter_context(connected(cluster, origin, problem, data_folder)).flying(fly)
+            pool = stack.enter_context(connected(cluster, origin, problem, data_folder, own)).flying(fly)
         out = stack.enter_context(taken(out, origin))
         blocks = Blocks.of(out, origin)
         blocks.forget_lost()

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from napf_mpc.errors import NapfError
+from napf_mpc.planners.registry import Factory
 from napf_mpc.problem import Problem
-from napf_mpc.provenance import differences, identity
+from napf_mpc.provenance import differences, identity, source_digest
 from napf_mpc.words import shown_text
 from napf_mpc.workers import DIED, Lost, guarded
 
@@ -131,7 +132,11 @@ class Cluster:
 
 @contextlib.contextmanager
 def connected(
-    address: str, origin: Mapping[str, Any], problem: Problem, data_folder: Path | None = None
+    address: str,
+    origin: Mapping[str, Any],
+    problem: Problem,
+    data_folder: Path | None = None,
+    own: Mapping[str, Factory] | None = None,
 ) -> Iterator[Cluster]:
     """Connect to a scheduler whose workers are all like this process.
 
@@ -145,6 +150,8 @@ def connected(
         What is flown.
     data_folder : Path, optional
         Where data files lie, on every worker; None for each worker's own.
+    own : mapping of str to callable, optional
+        Registered planners among those that fly.
 
     Raises
     ------
@@ -158,11 +165,12 @@ def connected(
     except ImportError as error:
         raise NapfError(f"{name}: needs the package distributed: pip install 'napf-mpc[cluster]'") from error
     folder = None if data_folder is None else Path(data_folder).resolve()
-    agree = partial(differing, dict(origin), problem, folder)
+    agree = partial(differing, dict(origin), problem, folder, dict(own or {}))
     with _quiet(), contextlib.ExitStack() as stack:
         client = _client(Client, address, name)
         stack.callback(_leave, client)
-        _check_workers(client, name, agree)
+        hint = "; modules of planners of your own must be installed there, too" if own else ""
+        _check_workers(client, name, agree, hint)
         cluster = Cluster(client, name, agree)
         stack.callback(cluster.close)
         yield cluster
@@ -195,7 +203,7 @@ def _client(kind: Any, address: str, name: str) -> Any:
     return client
 
 
-def _check_workers(client: Any, name: str, agree: Callable[[], list[str]]) -> None:
+def _check_workers(client: Any, name: str, agree: Callable[[], list[str]], hint: str) -> None:
     """Refuse workers that would not give the same bits."""
     try:
         client.wait_for_workers(1, timeout=CONNECT_S)
@@ -203,22 +211,28 @@ def _check_workers(client: Any, name: str, agree: Callable[[], list[str]]) -> No
         raise NapfError(f"{name}: has no workers; start some there with: dask worker ADDRESS") from error
     try:
         answers = client.run(agree, on_error="return")
-    except Exception as error:  # of the network
-        raise NapfError(f"{name}: the scheduler went away while its workers were asked") from error
+    except Exception as error:  # of the network, or of a planner that cannot be sent
+        reason = shown_text(" ".join(str(error).split()), 160)
+        raise NapfError(f"{name}: its workers could not be asked: {reason}") from error
     faults = []
     for worker, found in sorted(answers.items()):
         if isinstance(found, NapfError):
             faults.append(f"{name}: worker {worker}: {found}")
         elif isinstance(found, Exception):
             reason = shown_text(f"{type(found).__name__}: {found}", 160)
-            faults.append(f"{name}: worker {worker} cannot load this version of napf-mpc: {reason}")
+            faults.append(f"{name}: worker {worker} cannot load this version of napf-mpc: {reason}{hint}")
         elif found:
             faults.append(f"{name}: worker {worker} is not like this process: {'; '.join(found)}")
     if faults:
         raise NapfError("\n".join(faults))
 
 
-def differing(origin: Mapping[str, Any], problem: Problem, data_folder: Path | None) -> list[str]:
+def differing(
+    origin: Mapping[str, Any],
+    problem: Problem,
+    data_folder: Path | None,
+    own: Mapping[str, Factory] | None = None,
+) -> list[str]:
     """Lines on what of a campaign's origin is different in this process: versions, code, data files.
 
     Raises
@@ -227,7 +241,11 @@ def differing(origin: Mapping[str, Any], problem: Problem, data_folder: Path | N
         If a data file is missing here.
     """
     ours = identity(problem, origin["problem"], origin["planners"], origin["seed"], data_folder)
-    compared = {key: origin[key] for key in ours}
+    # A planner that travels whole has no source to be read here.
+    sources = {name: source_digest(factory) for name, factory in (own or {}).items()}
+    read = {name: digest for name, digest in sources.items() if digest != "unknown"}
+    ours["own_planners"] = origin.get("own_planners", {}) | read
+    compared = {key: origin.get(key, {}) for key in ours}
     return differences(json.loads(json.dumps(ours)), json.loads(json.dumps(compared)))
 
 

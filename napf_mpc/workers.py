@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
 from napf_mpc.errors import NapfError
+from napf_mpc.words import shown_text
 
 T = TypeVar("T")
 
@@ -30,6 +31,8 @@ HUNG_LEAST_S = 1800.0
 """... but no less than this, which covers compilation on a busy machine."""
 HUNG_FIRST_S = 21_600.0
 """While none is finished yet."""
+_UNREAD = "A task has failed to un-serialize"
+"""What loky says of a worker that could not read its task; one that died writes nothing, or half a result."""
 _LOOK_S = 1.0
 _WATCH_S = 0.5
 _ONE_THREAD = dict.fromkeys(
@@ -268,8 +271,15 @@ class _Processes:
     def result(self, future: Future[Any]) -> Any:
         try:
             return future.result()
-        except BrokenProcessPool:
-            return DIED
+        except (NapfError, MemoryError):
+            raise
+        except BrokenProcessPool as error:
+            unread = str(error).startswith(_UNREAD) and "MemoryError" not in str(error.__cause__)
+            if not unread or error.__cause__ is None:
+                return DIED
+            raise _not_given(error.__cause__) from error
+        except Exception as error:  # its task could not be written
+            raise _not_given(error.__cause__ or error) from error
 
     def release(self, future: Future[Any], *, usable: bool) -> None:
         worker = self._busy.pop(future)
@@ -287,6 +297,14 @@ class _Processes:
             with ThreadPoolExecutor(min(32, len(self._all))) as ends:  # all at once: a stop must be prompt
                 for worker in self._all:
                     ends.submit(worker.end)
+
+
+def _not_given(cause: BaseException) -> NapfError:
+    reason = shown_text(str(cause).strip().strip('"').strip().splitlines()[-1], 200)
+    return NapfError(
+        f"a worker cannot be given its task: {reason}; define planners of your own in a module that workers "
+        "find (PYTHONPATH, or an installed package), or fly with --workers 1"
+    )
 
 
 class _Worker:

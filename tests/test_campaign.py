@@ -3,6 +3,9 @@
 import hashlib
 import json
 import shutil
+import sys
+import threading
+import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,9 @@ from napf_mpc.campaign import block_size, check_flyable, chunks, compare, run_ca
 from napf_mpc.errors import DataError, NapfError, OutputError, ProblemError, SceneError
 from napf_mpc.evaluate import METRICS, Outcome
 from napf_mpc.mission import fly_mission
+from napf_mpc.planners import registry
+from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner
+from napf_mpc.planners.registry import Factory, register_planner
 from napf_mpc.prefix import Prefix, looks
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
@@ -614,6 +620,100 @@ def test_folders_may_be_texts_and_numbers_those_of_numpy(tmp_path: Path) -> None
 def test_what_is_no_folder_is_refused(out: Any) -> None:
     with pytest.raises(OutputError, match=f"out = {out}: is not the path of a folder"):
         run_campaign(brief(), ["apf"], 1, 0, out)
+
+
+# ------------------------------------------------------------------------------------- planners of one's own
+
+
+class Mine(ApfPlanner):
+    """APF that a module defines: other processes import it by name."""
+
+
+@pytest.fixture
+def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Inside(ApfPlanner):
+        """APF that no other process can import: it travels whole."""
+
+    monkeypatch.setattr(registry, "_OWN", {})
+    register_planner("mine", Mine)
+    register_planner("inside", Inside)
+
+
+@pytest.mark.parametrize("planners", [["apf", Mine(brief())], [Mine], Mine(brief()), [["apf"]], [None]])
+def test_a_planner_in_place_of_its_name_is_refused_with_the_way_out(planners: Any, tmp_path: Path) -> None:
+    told = r"not a (list of )?name.*: register_planner\(name, factory\).*simulate"
+    with pytest.raises(ProblemError, match=told):
+        compare(brief(), planners, runs=2)
+    with pytest.raises(ProblemError, match=told):
+        run_campaign(brief(), planners, 2, 0, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("_registered")
+@pytest.mark.parametrize(("workers", "block_runs"), [(1, None), (2, 3)])
+def test_planners_of_ones_own_fly_by_their_names_in_any_process(
+    workers: int, block_runs: int | None, tmp_path: Path
+) -> None:
+    names = ["apf", "mine", "inside"]
+    fly(tmp_path, 6, planners=names, workers=workers, block_runs=block_runs, record_every=25)
+    rows = store.read_table(tmp_path / "runs.parquet")
+    tracks = store.read_table(tmp_path / "trajectories.parquet")
+    for name in names:
+        for table, column in ((rows, "control_effort"), (tracks, "x_m")):
+            theirs = table[column][table["planner"] == "apf"]
+            np.testing.assert_array_equal(table[column][table["planner"] == name], theirs)
+            assert len(theirs) >= 6
+    assert compare(brief(), names, runs=6, seed=7)["planners"]["mine"]["runs"] == 6
+
+
+@pytest.mark.usefixtures("_registered")
+def test_the_source_of_ones_own_planner_belongs_to_the_origin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fly(tmp_path, 1, planners=["mine"])
+    held = store.read_json(tmp_path / "campaign.json")["own_planners"]
+    assert held == {"mine": hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16]}
+    fly(tmp_path, 2, planners=["mine"])
+    monkeypatch.setattr(registry, "_OWN", {"mine": ApfPlanner})
+    with pytest.raises(OutputError, match=r"own_planners\.mine = "):
+        fly(tmp_path, 2, planners=["mine"])
+    typed = eval("lambda problem: None", {"__name__": "__main__"})
+    assert provenance.source_digest(typed) == "unknown"
+    fly(tmp_path / "shipped", 1, planners=["apf"])
+    assert "own_planners" not in store.read_json(tmp_path / "shipped" / "campaign.json")
+
+
+def locked() -> Factory:
+    lock = threading.Lock()
+    return lambda problem: ApfPlanner(problem) if lock else NapfPlanner(problem)
+
+
+def homeless(monkeypatch: pytest.MonkeyPatch) -> Factory:
+    module: Any = types.ModuleType("nowhere_to_be_found")
+    module.Mine = type("Mine", (ApfPlanner,), {"__module__": module.__name__})
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    made: Factory = module.Mine
+    return made
+
+
+@pytest.mark.parametrize(
+    ("how", "reason"),
+    [
+        ("locked", "cannot pickle '_thread.lock' object"),
+        ("homeless", "No module named 'nowhere_to_be_found'"),
+    ],
+)
+def test_a_planner_that_workers_cannot_have_is_an_error_and_no_lost_block(
+    how: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry, "_OWN", {})
+    register_planner("own", locked() if how == "locked" else homeless(monkeypatch))
+    with pytest.raises(
+        NapfError, match=f"a worker cannot be given its task: .*{reason}; define .*--workers 1"
+    ):
+        fly(tmp_path, 4, planners=["own"], workers=2, block_runs=2)
+    assert not list((tmp_path / "blocks").glob("*"))
+    fly(tmp_path, 4, planners=["own"], block_runs=2)
 
 
 def test_a_seed_of_thousands_of_digits_is_refused_in_few_words() -> None:

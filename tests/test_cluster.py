@@ -8,19 +8,25 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+import types
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from campaign_torture import PROBLEM, START, finished
 
 from napf_mpc import cluster as cluster_module
+from napf_mpc import store
 from napf_mpc.campaign import run_campaign
 from napf_mpc.cli import run_command
 from napf_mpc.cluster import connected, differing
 from napf_mpc.errors import NapfError
+from napf_mpc.planners import registry
+from napf_mpc.planners.potential_field import ApfPlanner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.provenance import identity
@@ -86,6 +92,44 @@ def test_a_local_cluster_changes_no_bit(
 def test_a_campaign_goes_on_from_one_engine_to_another(local: str, undisturbed: str, tmp_path: Path) -> None:
     run_campaign(brief(), ["apf"], 8, 7, tmp_path, block_runs=3)
     assert fly(local, tmp_path, block_runs=5) == undisturbed
+
+
+def test_a_planner_of_ones_own_flies_there_too(
+    local: str, undisturbed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Inside(ApfPlanner):
+        """Workers cannot import it: it travels whole."""
+
+    monkeypatch.setattr(registry, "_OWN", {"mine": Inside})
+    run_campaign(brief(), ["apf", "mine"], 4, 7, tmp_path, cluster=local, block_runs=2)
+    rows = store.read_table(tmp_path / "runs.parquet")
+    effort = [rows["control_effort"][rows["planner"] == name] for name in ("apf", "mine")]
+    np.testing.assert_array_equal(*effort)
+
+
+def test_a_planner_that_the_workers_cannot_have_is_named(
+    local: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module: Any = types.ModuleType("nowhere_to_be_found")
+    module.Mine = type("Mine", (ApfPlanner,), {"__module__": module.__name__})
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(registry, "_OWN", {"mine": module.Mine})
+    told = r"worker tcp://\S+ cannot load .*nowhere_to_be_found.*; modules of planners of your own must"
+    with pytest.raises(NapfError, match=told):
+        run_campaign(brief(), ["mine"], 2, 7, tmp_path / "out", cluster=local)
+    lock = threading.Lock()
+    monkeypatch.setattr(registry, "_OWN", {"mine": lambda problem: ApfPlanner(problem) if lock else None})
+    with pytest.raises(NapfError, match=r"its workers could not be asked: .*(pickle|serialize)"):
+        run_campaign(brief(), ["mine"], 2, 7, tmp_path / "out", cluster=local)
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_source_of_a_planner_is_a_difference() -> None:
+    held = origin() | {"planners": ["mine"], "own_planners": {"mine": "0123456789abcdef"}}
+    (line,) = differing(held, brief(), None, {"mine": ApfPlanner})
+    assert re.fullmatch("own_planners.mine = [0-9a-f]{16}, not 0123456789abcdef", line)
+    # One that travelled whole has no source to be read there.
+    assert differing(held, brief(), None, {"mine": eval("lambda problem: None", {"__name__": "x"})}) == []
 
 
 def die(block: range) -> int:

@@ -10,6 +10,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from napf_mpc.constraints.clearance import influence_model
+from napf_mpc.planners import registry
 from napf_mpc.planners.mpc import default_constraints
 from napf_mpc.planners.plan import stage_grid
 from napf_mpc.planners.tally import COLUMNS
@@ -25,13 +26,14 @@ BLOCKS = re.findall(
 
 @pytest.fixture(scope="module")
 def session() -> dict[str, Any]:
-    """Names after all blocks, each executed after the one before; registered solvers are forgotten again."""
+    """Names after all blocks, each executed after the one before; what is registered is forgotten again."""
     names: dict[str, Any] = {"__name__": "page"}
     # Small matrices: more threads than one would only wait for each other.
     with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
         patch.setattr(solver, "_FACTORIES", {})
         patch.setattr(solver, "_NAMES", set(solver._NAMES))
         patch.setattr(batch, "_BATCH_FACTORIES", {})
+        patch.setattr(registry, "_OWN", {})
         for place, block in enumerate(BLOCKS):
             exec(compile(block, f"{PAGE.name}, block {place + 1}", "exec"), names)
             names.setdefault("commands", []).append(names["command"])
@@ -78,6 +80,14 @@ def test_every_count_of_the_tally_is_in_the_table() -> None:
 def test_the_planner_from_nothing_flies(session: dict[str, Any]) -> None:
     assert str(session["flown"].score.outcome[0]) in ("reached", "collided")
     assert bool(session["flown"].score.finished[0])
+
+
+def test_the_planner_from_nothing_is_compared_by_its_name(session: dict[str, Any]) -> None:
+    assert "over" not in registry.planner_names()
+    found = session["summary"]["planners"]
+    assert list(found) == ["napf", "over"]
+    assert found["over"]["runs"] == found["napf"]["runs"] == 2
+    assert found["over"]["path_rms_m"]["mean"] != found["napf"]["path_rms_m"]["mean"]
 
 
 QP_PAGE = (PAGE.parent / "qp_planner.md").read_text(encoding="utf-8")

@@ -5,13 +5,16 @@ import re
 import signal
 import sys
 import time
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from napf_mpc.errors import NapfError, ProblemError
-from napf_mpc.workers import DIED, HUNG, MAX_LOST, Lost, in_workers
+from napf_mpc.workers import DIED, HUNG, MAX_LOST, Lost, _Processes, in_workers
 
 BLOCKS = [range(first, first + 3) for first in range(0, 30, 3)]
 
@@ -111,6 +114,25 @@ def test_when_block_after_block_is_lost_nothing_more_is_tried(workers: int) -> N
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="process ids are looked up as POSIX does")
+@pytest.mark.parametrize(
+    ("said", "cause"),
+    [
+        ("A result has failed to un-serialize. Please", "EOFError"),
+        ("A task has failed to un-serialize. Please", "MemoryError"),
+        ("A worker process managed by the executor was unexpectedly terminated.", None),
+    ],
+)
+def test_a_worker_that_dies_half_way_is_dead_and_its_task_is_not_to_blame(
+    said: str, cause: str | None
+) -> None:
+    """Killed while it writes its result, it leaves half of it; with memory short it cannot read on."""
+    error = BrokenProcessPool(said)
+    error.__cause__ = None if cause is None else Exception(f'\n"""\nTraceback\n{cause}\n"""')
+    future: Future[Any] = Future()
+    future.set_exception(error)
+    assert _Processes(str, 1).result(future) == DIED
+
+
 def test_closing_ends_the_workers(tmp_path: Path) -> None:
     results = in_workers(partial(wait, tmp_path), BLOCKS, 2)
     next(results)

@@ -156,6 +156,18 @@ class Planner(Protocol):
         ...
 
 
+def planner_fault(planner: object) -> str:
+    """Why something is no planner, in words; empty if it is one."""
+    if isinstance(planner, type):
+        return f"is the class {planner.__name__}, not a planner of it: give {planner.__name__}(problem)"
+    kind = type(planner).__name__
+    missing = [name for name in ("name", "reset", "step") if not hasattr(planner, name)]
+    if missing:
+        return f"is a {kind}: it has no {', '.join(missing)}"
+    name = planner.name  # type: ignore[attr-defined]
+    return "" if isinstance(name, str) and name else f"is a {kind}: its name must be a text that is not empty"
+
+
 def tally_of(planner: Planner, runs: int) -> Tally:
     """What a planner counted in each run; zeros for one that counts nothing."""
     tally = getattr(planner, "tally", None)
