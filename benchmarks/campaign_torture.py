@@ -38,7 +38,7 @@ length_m = 100.0
 [world]
 kind = "lanes"
 count = 8
-along_range_m = [0.0, 6.0]
+along_range_m = [3.0, 9.0]
 [simulation]
 time_limit_s = 2.5
 """

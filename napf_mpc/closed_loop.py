@@ -46,6 +46,7 @@ from napf_mpc.vehicle.tracking import TrackingLaw, tracking_law
 from napf_mpc.world.moving import MovingObstacles, moving_obstacles
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.scenes import build_scenes
+from napf_mpc.world.starts import Starts
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -106,20 +107,44 @@ def initial_state(problem: Problem) -> Array:
     return state
 
 
+def formation_starts(problem: Problem) -> Starts:
+    """Where the UAVs of a formation start, the same in every run."""
+    given = formation_mission(problem).initial_positions_m is not None
+    keys = "mission.initial_positions_m" if given else "mission.start_m or the formation"
+    return Starts(initial_state(problem)[:, POSITION], problem.vehicle.radius_m, keys)
+
+
+def formation_scenes(
+    problem: Problem, seed: Seed, runs: range, data_folder: Path | None = None
+) -> ObstacleSet:
+    """Obstacles of some runs of a formation's campaign: one scene a run, or one for all.
+
+    Raises
+    ------
+    NapfError
+        If a scene cannot be built, a UAV would start in contact, or data are missing.
+    """
+    frame = PathFrame.of_mission(formation_mission(problem))
+    lanes = formation_offsets(problem.formation)[:, 1]
+    return build_scenes(problem.world, frame, lanes, seed, runs, data_folder, formation_starts(problem))
+
+
 def build_scenario(problem: Problem, seed: Seed, runs: range, data_folder: Path | None = None) -> Scenario:
     """Draw obstacles, initial state and navigation errors of some runs of a campaign.
 
     Raises
     ------
     NapfError
-        If the scene cannot be built, a data file is missing, or the inner loop would be unstable.
+        If the scene cannot be built, a UAV would start in contact, a data file is missing, or the inner loop
+        would be unstable.
     """
-    mission = formation_mission(problem)
+    formation_mission(problem)
     check_sampled_loop(problem.vehicle, 1.0 / problem.simulation.controller_rate_hz)
-    frame = PathFrame.of_mission(mission)
-    lanes = formation_offsets(problem.formation)[:, 1]
     start = np.broadcast_to(initial_state(problem), (len(runs), problem.uav_count, 12))
-    obstacles = build_scenes(problem.world, frame, lanes, seed, runs, data_folder)
+    obstacles = formation_scenes(problem, seed, runs, data_folder)
+    moving = moving_obstacles(problem.world, seed, runs, problem.simulation.time_limit_s)
+    if moving is not None:
+        formation_starts(problem).refuse_moving(moving)
     errors = _errors(problem, seed, runs, obstacles, data_folder)
     mapped = problem.planner.covariance == "mapped"
     return Scenario(
@@ -128,7 +153,7 @@ def build_scenario(problem: Problem, seed: Seed, runs: range, data_folder: Path 
         obstacles,
         start.copy(),
         errors,
-        moving_obstacles(problem.world, seed, runs, problem.simulation.time_limit_s),
+        moving,
         sigma_map(problem, errors.scene) if mapped and isinstance(errors, GnssErrors) else None,
     )
 

@@ -20,6 +20,7 @@ from napf_mpc.store import Columns
 from napf_mpc.words import shown_text
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.scenes import build_scenes
+from napf_mpc.world.starts import Starts
 from napf_mpc.world.sweep import SweptClearance
 
 Array = NDArray[np.float64]
@@ -46,7 +47,8 @@ def goal_scenes(
     offset = np.subtract(mission.goal_m, mission.start_m)
     heading = float(np.arctan2(offset[1], offset[0]))
     frame = PathFrame.from_angles((*mission.start_m, 0.0), heading, 0.0)
-    return build_scenes(problem.world, frame, np.zeros(1), seed, runs, data_folder)
+    starts = Starts(frame.origin[None], problem.vehicle.radius_m)
+    return build_scenes(problem.world, frame, np.zeros(1), seed, runs, data_folder, starts)
 
 
 def planar_distances(obstacles: ObstacleSet, influence_m: float, position: Array) -> tuple[Array, Array]:

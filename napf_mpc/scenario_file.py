@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from napf_mpc import store
-from napf_mpc.closed_loop import initial_state
+from napf_mpc.closed_loop import formation_scenes, initial_state
 from napf_mpc.errors import DataError
-from napf_mpc.formation import PathFrame, formation_offsets
 from napf_mpc.goal_walk import goal_scenes
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.world.moving import MovingObstacles, moving_obstacles
 from napf_mpc.world.obstacles import ObstacleSet
-from napf_mpc.world.scenes import build_scenes
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
 
 Array = NDArray[np.float64]
@@ -35,13 +33,11 @@ def scenes_of(
     Raises
     ------
     NapfError
-        If a scene cannot be built, or data are missing.
+        If a scene cannot be built, the mission would start in contact, or data are missing.
     """
-    mission = problem.mission
-    if not isinstance(mission, FormationMission):
+    if not isinstance(problem.mission, FormationMission):
         return goal_scenes(problem, seed, runs, data_folder)
-    lanes = formation_offsets(problem.formation)[:, 1]
-    return build_scenes(problem.world, PathFrame.of_mission(mission), lanes, seed, runs, data_folder)
+    return formation_scenes(problem, seed, runs, data_folder)
 
 
 def moving_of(problem: Problem, seed: int = 0, runs: range = range(1)) -> MovingObstacles | None:

@@ -10,6 +10,8 @@ from napf_mpc.goal_walk import goal_mission, goal_scenes, walk_block, walk_to_go
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.scenario_file import scenes_of
+from napf_mpc.world.obstacles import ObstacleSet
+from napf_mpc.world.shapes import Sphere
 
 BALL = {"shape": "sphere", "radius_m": 1.0}
 
@@ -51,7 +53,9 @@ def test_an_obstacle_right_in_the_way_stops_the_walk() -> None:
 
 
 def test_a_start_inside_an_obstacle_is_a_collision() -> None:
-    _, block = walk((0.0, 0.3))
+    # Such a problem is refused when its scene is built; whoever brings a scene is judged all the same.
+    problem, _ = walk()
+    block = walk_block(problem, "apf", 3, 7, ObstacleSet.from_shapes([Sphere((0.0, 0.3, 0.0), 1.0)]))
     assert block.rows["outcome"][0] == "collided"
     assert block.rows["uavs_hit"][0] == 1
     assert block.rows["min_clearance_m"][0] == pytest.approx(-0.7, abs=0.05)

@@ -31,6 +31,14 @@ class ApartRules:
     min_gap_m: float
     climb_sine: float = 0.0
     """Sine of the path's climb, which foreshortens along and height in the horizontal plane."""
+    starts_m: tuple[tuple[float, float, float], ...] = ()
+    """Points to stay clear of: ahead and left in the horizontal plane, up from where heights count."""
+    start_reach_m: float = 0.0
+    """Distance that surfaces keep from those points."""
+    below_m: float = 0.0
+    """How far an obstacle goes on below its height with the same radius, under a cap as round as a ball."""
+    above_m: float = 0.0
+    """The same above its height. A ball goes on nowhere."""
 
     @property
     def climb_cosine(self) -> float:
@@ -53,7 +61,7 @@ class ApartRules:
 
 
 def place_apart(uniforms: Callable[[int], Array], rules: ApartRules) -> Array:
-    """Place obstacles one after the other, each uniform over what the earlier ones leave free.
+    """Place obstacles one after the other, each uniform over what the earlier ones and the starts leave free.
 
     An obstacle keeps its radius and height while places are tried for it, so that the law of the radii is not
     bent towards the small ones. Each try uses one row of four uniforms (along, lateral, height, radius; the
@@ -83,12 +91,16 @@ def place_apart(uniforms: Callable[[int], Array], rules: ApartRules) -> Array:
     following = np.full(count, -1, dtype=np.int64)
     ranges = np.array([rules.along_m, rules.lateral_m, rules.height_m, rules.radius_m])
     plane = np.array([rules.climb_cosine, rules.climb_sine, x_low, x_high, y_low, y_high])
+    starts = np.array(rules.starts_m, dtype=np.float64).reshape(-1, 3)
+    upright = np.array([rules.start_reach_m, rules.below_m, rules.above_m])
     placed = np.empty((count, 4))
     done, tries = 0, 0
     while done < count and tries < MAX_TRIES:
         wanted = min(2 * (count - done) + 16, _MAX_CHUNK)
         rows = uniforms(wanted)
-        done, tries = _place(rows, ranges, plane, rules.min_gap_m, placed, done, tries, first, following)
+        done, tries = _place(
+            rows, ranges, plane, rules.min_gap_m, starts, upright, placed, done, tries, first, following
+        )
         if len(rows) < wanted:
             break
     return placed[:done]
@@ -100,6 +112,8 @@ def _place(
     ranges: Array,
     plane: Array,
     gap: float,
+    starts: Array,
+    upright: Array,
     placed: Array,
     done: int,
     tries: int,
@@ -121,7 +135,8 @@ def _place(
         y = placed[done, 1]
         i = _cell(x, x_low, x_high, cells_x)
         j = _cell(y, y_low, y_high, cells_y)
-        free = True
+        z = sine * placed[done, 0] + cosine * placed[done, 2]
+        free = not _near_start(starts, upright, x, y, z, placed[done, 3])
         for near_i in range(max(i - 1, 0), min(i + 2, cells_x)):
             for near_j in range(max(j - 1, 0), min(j + 2, cells_y)):
                 other = first[near_i, near_j]
@@ -137,6 +152,19 @@ def _place(
             done += 1
             tries = 0
     return done, tries
+
+
+@compiled
+def _near_start(starts: Array, upright: Array, x: float, y: float, z: float, radius: float) -> bool:
+    """Whether an obstacle reaches one of the points to stay clear of."""
+    reach, below, above = upright
+    least = radius + reach
+    for k in range(len(starts)):
+        dx, dy = starts[k, 0] - x, starts[k, 1] - y
+        dz = max(starts[k, 2] - z - above, z - below - starts[k, 2], 0.0)
+        if dx * dx + dy * dy + dz * dz <= least * least:
+            return True
+    return False
 
 
 @compiled

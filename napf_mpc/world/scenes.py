@@ -3,7 +3,8 @@
 Random scenes are maps from uniform numbers, so that a method for rare events can drive them; only
 `build_scenes` draws. Random places are given along the path, to its left and up from it. The scenes of the
 paper, ``lanes`` (8 obstacles) and ``scatter`` (40), follow a climbing path. What stands on the ground,
-``forest`` and ``street_canyon``, is laid out on level ground under the path's heading.
+``forest`` and ``street_canyon``, is laid out on level ground under the path's heading. What would stand on
+a UAV's initial place is drawn again, with further numbers of its own run.
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ from napf_mpc.streams import Seed, Stream, generator
 from napf_mpc.world.apart import MAX_TRIES, ApartRules, place_apart
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Cylinder, Prism, Shape, Sphere
+from napf_mpc.world.starts import Starts
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 MAX_OBSTACLES = 20_000_000
 """Obstacles of all scenes together: about two gigabytes."""
@@ -54,6 +57,7 @@ def build_scenes(
     seed: Seed,
     runs: range,
     data_folder: Path | None = None,
+    starts: Starts | None = None,
 ) -> ObstacleSet:
     """Obstacles of some runs of a campaign.
 
@@ -71,6 +75,8 @@ def build_scenes(
         Indices of the runs. A scene depends on the seed and its run's index only.
     data_folder : Path, optional
         Where city files are looked for, see `napf_mpc.data_folder.find_data_file`.
+    starts : Starts, optional
+        Where UAVs start: random obstacles keep clear of it, listed obstacles and cities must not touch it.
 
     Returns
     -------
@@ -80,7 +86,7 @@ def build_scenes(
     Raises
     ------
     SceneError
-        If the obstacles do not fit.
+        If the obstacles do not fit, or a UAV would start in contact with one.
     DataError
         If a city file cannot be used.
     ValueError
@@ -91,35 +97,43 @@ def build_scenes(
         raise ValueError("runs is empty: a scene needs a run")
     if lanes.ndim != 1 or lanes.size == 0 or not np.isfinite(lanes).all():
         raise ValueError(f"lateral_lanes = {lanes.tolist()}, must be at least one finite number in a row")
+    starts = Starts() if starts is None else starts
     match world:
         case EmptyWorld():
             return ObstacleSet.empty()
         case ObstacleList():
-            return ObstacleSet.from_shapes(
+            listed = ObstacleSet.from_shapes(
                 [_listed(f"world.obstacles[{i}]", item) for i, item in enumerate(world.obstacles)]
             )
+            starts.refuse_contact(listed, lambda i: f"world.obstacles[{i}]")
+            return listed
         case City():
             # Reading polygons costs an import that no other world needs.
             from napf_mpc.world.city import load_city
 
-            return load_city(world, data_folder)
+            city = load_city(world, data_folder)
+            starts.refuse_contact(city, lambda _: f'a building of world.file = "{world.file}"')
+            return city
         case StreetCanyon():
-            return ObstacleSet.stack([_street(world, frame, seed, run) for run in runs])
+            return ObstacleSet.stack([_street(world, frame, seed, run, starts) for run in runs])
         case Lanes():
             _check_size(world.count, runs)
-            u = np.stack([generator(seed, run, Stream.SCENE).random((world.count, 5)) for run in runs])
-            return _round_scenes(world, frame, *lanes_from_uniforms(world, lanes, u))
+            drawn = [_lanes(world, frame, lanes, seed, run, starts) for run in runs]
+            places, radii = (np.stack(rows) for rows in zip(*drawn, strict=True))
+            return _round_scenes(world, frame, places, radii)
         case Scatter():
-            placed = _draw_apart(scatter_rules(world, frame), seed, runs)
+            placed = _draw_apart(scatter_rules(world, frame, starts), seed, runs)
             return _round_scenes(world, frame, placed[..., :3], placed[..., 3])
         case Forest():
-            placed = _draw_apart(forest_rules(world), seed, runs)
+            placed = _draw_apart(forest_rules(world, frame, starts), seed, runs)
             trunks = _on_ground(frame, placed[..., 0], placed[..., 1])
             top = world.ground_m + placed[..., 2]
             return ObstacleSet.from_cylinders(trunks, placed[..., 3], world.ground_m, top)
 
 
-def lanes_from_uniforms(world: Lanes, lateral_lanes: Array, u: Array) -> tuple[Array, Array]:
+def lanes_from_uniforms(
+    world: Lanes, lateral_lanes: Array, u: Array, strata: NDArray[np.int64] | None = None
+) -> tuple[Array, Array]:
     """Map uniforms to the paper's obstacles on the lanes: one in each along-track stratum.
 
     Along track uniform in the obstacle's stratum; lateral place a random lane plus U(-jitter, jitter); height
@@ -131,27 +145,33 @@ def lanes_from_uniforms(world: Lanes, lateral_lanes: Array, u: Array) -> tuple[A
         Number, ranges and jitters.
     lateral_lanes : array, shape (uav,)
         Lateral place of each UAV [m].
-    u : array, shape (..., count, 5)
+    u : array, shape (..., n, 5)
         Uniforms on [0, 1): place in the stratum, lane, lateral jitter, height, radius.
+    strata : array of int, shape (n,), optional
+        Stratum of each obstacle; by default those of all obstacles, in order.
 
     Returns
     -------
-    places : array, shape (..., count, 3)
+    places : array, shape (..., n, 3)
         Along, left, up [m].
-    radii : array, shape (..., count)
+    radii : array, shape (..., n)
         Radii [m].
     """
-    count = u.shape[-2]
+    strata = np.arange(world.count) if strata is None else strata
     low, high = world.along_range_m
-    along = low + (np.arange(count) + u[..., 0]) * ((high - low) / max(count, 1))
+    along = low + (strata + u[..., 0]) * ((high - low) / max(world.count, 1))
     lane = np.minimum((u[..., 1] * len(lateral_lanes)).astype(np.int64), len(lateral_lanes) - 1)
     lateral = lateral_lanes[lane] + (2.0 * u[..., 2] - 1.0) * world.lane_jitter_m
     height = (2.0 * u[..., 3] - 1.0) * world.height_jitter_m
     return np.stack([along, lateral, height], axis=-1), _between(world.radius_m, u[..., 4])
 
 
-def scatter_rules(world: Scatter, frame: PathFrame) -> ApartRules:
-    """Rules for `place_apart` that make the paper's scattered obstacles; spheres and cylinders share them."""
+def scatter_rules(world: Scatter, frame: PathFrame, starts: Starts) -> ApartRules:
+    """Rules for `place_apart` that make the paper's scattered obstacles.
+
+    Spheres and cylinders share them, but for what they cover above and below.
+    """
+    onward = math.inf if world.shape == "cylinder" else 0.0
     return ApartRules(
         world.count,
         world.along_range_m,
@@ -160,10 +180,14 @@ def scatter_rules(world: Scatter, frame: PathFrame) -> ApartRules:
         world.radius_m,
         world.min_gap_m,
         float(frame.along[2]),
+        _level(frame, starts, float(frame.origin[2])),
+        starts.reach_m,
+        onward,
+        onward,
     )
 
 
-def forest_rules(world: Forest) -> ApartRules:
+def forest_rules(world: Forest, frame: PathFrame, starts: Starts) -> ApartRules:
     """Rules for `place_apart` that make a forest; its height column is the height of the trees."""
     return ApartRules(
         world.count,
@@ -172,6 +196,10 @@ def forest_rules(world: Forest) -> ApartRules:
         world.tree_height_m,
         world.radius_m,
         world.min_gap_m,
+        0.0,
+        _level(frame, starts, world.ground_m),
+        starts.reach_m,
+        math.inf,
     )
 
 
@@ -196,9 +224,14 @@ def fronts_from_uniforms(world: StreetCanyon, u: Array) -> Array:
     length = _between(world.building_length_m, u[:, 0])
     start = low + np.concatenate([[0.0], np.cumsum(length + world.gap_m)[:-1]])
     fits = high - start >= world.building_length_m[0]
-    height = _between(world.building_height_m, u[:, 1])
-    front = 0.5 * world.street_width_m - u[:, 2] * world.setback_m
-    return np.stack([start, np.minimum(length, high - start), front, height], axis=-1)[fits]
+    faces = _faces(world, u[:, 1:])
+    return np.column_stack([start, np.minimum(length, high - start), faces])[fits]
+
+
+def _faces(world: StreetCanyon, u: Array) -> Array:
+    """Distance of the front and height (building, 2) [m] of uniforms (building, 2): height, place."""
+    front = 0.5 * world.street_width_m - u[:, 1] * world.setback_m
+    return np.column_stack([front, _between(world.building_height_m, u[:, 0])])
 
 
 def masts_from_uniforms(world: StreetCanyon, u: Array) -> Array:
@@ -223,7 +256,7 @@ def masts_from_uniforms(world: StreetCanyon, u: Array) -> Array:
     return np.stack([_between(world.along_range_m, u[:, 0]), lateral, radius, height], axis=-1)
 
 
-def _street(world: StreetCanyon, frame: PathFrame, seed: Seed, run: int) -> ObstacleSet:
+def _street(world: StreetCanyon, frame: PathFrame, seed: Seed, run: int, starts: Starts) -> ObstacleSet:
     length = world.along_range_m[1] - world.along_range_m[0]
     shortest = world.building_length_m[0]
     if length < shortest:
@@ -242,21 +275,122 @@ def _street(world: StreetCanyon, frame: PathFrame, seed: Seed, run: int) -> Obst
             f"up to {rows} buildings would fit on a side of the street, at most {MAX_FRONTS} are built; "
             "shorten world.along_range_m or raise world.building_length_m or world.gap_m"
         )
-    shapes: list[Shape] = []
-    for axis, side in ((0, 1.0), (1, -1.0)):
-        fronts = fronts_from_uniforms(world, generator(seed, run, Stream.SCENE, axis=axis).random((rows, 3)))
-        depth = world.building_depth_m
-        middle = _on_ground(frame, fronts[:, 0] + 0.5 * fronts[:, 1], side * (fronts[:, 2] + 0.5 * depth))
-        for (x, y), (_, front_length, _, height) in zip(middle.tolist(), fronts.tolist(), strict=True):
-            centre = (x, y, world.ground_m + 0.5 * height)
-            shapes.append(Box(centre, (front_length, depth, height), frame.heading_rad))
-    masts = masts_from_uniforms(
-        world, generator(seed, run, Stream.SCENE, axis=2).random((world.mast_count, 4))
+    left = _houses(world, frame, seed, run, starts, rows, axis=0, side=1.0)
+    right = _houses(world, frame, seed, run, starts, rows, axis=1, side=-1.0)
+    return ObstacleSet.from_shapes([*left, *right, *_masts(world, frame, seed, run, starts)])
+
+
+def _houses(
+    world: StreetCanyon,
+    frame: PathFrame,
+    seed: Seed,
+    run: int,
+    starts: Starts,
+    rows: int,
+    axis: int,
+    side: float,
+) -> list[Shape]:
+    """Houses of one side of a street: those on a UAV's start get another front and height."""
+    stream = generator(seed, run, Stream.SCENE, axis=axis)
+    fronts = fronts_from_uniforms(world, stream.random((rows, 3)))
+    depth = world.building_depth_m
+
+    def houses(which: Index) -> list[Shape]:
+        start, length, front, height = fronts[which].T
+        middle = _on_ground(frame, start + 0.5 * length, side * (front + 0.5 * depth))
+        return [
+            Box((x, y, world.ground_m + 0.5 * high), (long, depth, high), frame.heading_rad)
+            for (x, y), long, high in zip(middle.tolist(), length.tolist(), height.tolist(), strict=True)
+        ]
+
+    def again(which: Index) -> None:
+        fronts[which, 2:] = _faces(world, stream.random((len(which), 2)))
+
+    _draw_clear(
+        len(fronts), lambda which: ObstacleSet.from_shapes(houses(which)), again, starts,
+        f"world.street_width_m = {world.street_width_m:g} m: in run {run} a building stands on",
+        "widen the street, shift world.along_range_m",
+    )  # fmt: skip
+    return houses(np.arange(len(fronts)))
+
+
+def _masts(world: StreetCanyon, frame: PathFrame, seed: Seed, run: int, starts: Starts) -> list[Shape]:
+    """Masts of a street: those on a UAV's start are put elsewhere, with the radius and height they have."""
+    stream = generator(seed, run, Stream.SCENE, axis=2)
+    u = stream.random((world.mast_count, 4))
+
+    def masts(which: Index) -> list[Shape]:
+        drawn = masts_from_uniforms(world, u[which])
+        feet = _on_ground(frame, drawn[:, 0], drawn[:, 1])
+        return [
+            Cylinder((x, y), radius, world.ground_m, world.ground_m + height)
+            for (x, y), (_, _, radius, height) in zip(feet.tolist(), drawn.tolist(), strict=True)
+        ]
+
+    def again(which: Index) -> None:
+        u[which, :2] = stream.random((len(which), 2))
+
+    _draw_clear(
+        len(u), lambda which: ObstacleSet.from_shapes(masts(which)), again, starts,
+        f"world.mast_count = {world.mast_count}: in run {run} a mast stands on",
+        "widen the street, shift world.along_range_m",
+    )  # fmt: skip
+    return masts(np.arange(len(u)))
+
+
+def _lanes(
+    world: Lanes, frame: PathFrame, lanes: Array, seed: Seed, run: int, starts: Starts
+) -> tuple[Array, Array]:
+    """Places (count, 3) and radii (count,) of a run: what is on a UAV's start moves, in its stratum."""
+    stream = generator(seed, run, Stream.SCENE)
+    u = stream.random((world.count, 5))
+
+    def obstacles(which: Index) -> ObstacleSet:
+        places, radii = lanes_from_uniforms(world, lanes, u[which], which)
+        return _round_scenes(world, frame, places[None], radii[None])
+
+    def again(which: Index) -> None:
+        u[which, :3] = stream.random((len(which), 3))
+
+    _draw_clear(
+        len(u), obstacles, again, starts,
+        f"world.along_range_m = {list(world.along_range_m)} m: in run {run} an obstacle stands on",
+        "shift the range, raise world.lane_jitter_m",
+    )  # fmt: skip
+    return lanes_from_uniforms(world, lanes, u)
+
+
+def _draw_clear(
+    count: int,
+    obstacles: Callable[[Index], ObstacleSet],
+    again: Callable[[Index], None],
+    starts: Starts,
+    asked: str,
+    way_out: str,
+) -> None:
+    """Draw again those of a run's obstacles that stand on a UAV's start, until none does.
+
+    Parameters
+    ----------
+    count : int
+        Number of obstacles.
+    obstacles, again : callable
+        ``obstacles(which)`` makes some of them, ``again(which)`` draws their places anew.
+    starts : Starts
+        What to stay clear of.
+    asked, way_out : str
+        Words for what cannot be.
+    """
+    which = np.arange(count)
+    for _ in range(MAX_TRIES):
+        which = which[starts.too_near(obstacles(which))]
+        if not len(which):
+            return
+        again(which)
+    raise SceneError(
+        f"{asked} a UAV's initial place, nearer than {starts.reach_m:g} m, wherever it is put in {MAX_TRIES} "
+        f"tries; {way_out}, or move the UAVs ({starts.keys})"
     )
-    feet = _on_ground(frame, masts[:, 0], masts[:, 1])
-    for (x, y), (_, _, radius, height) in zip(feet.tolist(), masts.tolist(), strict=True):
-        shapes.append(Cylinder((x, y), radius, world.ground_m, world.ground_m + height))
-    return ObstacleSet.from_shapes(shapes)
 
 
 def _draw_apart(rules: ApartRules, seed: Seed, runs: range) -> Array:
@@ -266,6 +400,7 @@ def _draw_apart(rules: ApartRules, seed: Seed, runs: range) -> Array:
         "lower world.count, world.min_gap_m or world.radius_m, or widen world.along_range_m or "
         "world.lateral_range_m"
     )
+    taken = ", clear of the UAVs' initial places" if rules.starts_m else ""
     asked = f"world.count = {rules.count} with world.min_gap_m = {rules.min_gap_m:g} m"
     if rules.surely_too_many():
         raise SceneError(f"{asked} need more area than there is; {way_out}")
@@ -274,8 +409,8 @@ def _draw_apart(rules: ApartRules, seed: Seed, runs: range) -> Array:
         placed = place_apart(_rows_of_four(generator(seed, run, Stream.SCENE)), rules)
         if len(placed) < rules.count:
             raise SceneError(
-                f"{asked}: in run {run} only {len(placed)} found a place, the next one none in {MAX_TRIES} "
-                f"tries; {way_out}"
+                f"{asked}: in run {run} only {len(placed)} found a place{taken}, the next one none in "
+                f"{MAX_TRIES} tries; {way_out}"
             )
         out[r] = placed
     return out
@@ -308,6 +443,17 @@ def _on_ground(frame: PathFrame, along: Array, lateral: Array) -> Array:
     """World (..., 2) of distances along the path's heading and to its left, both horizontal [m]."""
     ahead = np.array([frame.left[1], -frame.left[0]])
     return np.asarray(frame.origin[:2] + along[..., None] * ahead + lateral[..., None] * frame.left[:2])
+
+
+def _level(frame: PathFrame, starts: Starts, zero_m: float) -> tuple[tuple[float, float, float], ...]:
+    """Starts ahead and left of the path's origin in the horizontal plane, and up from a height [m]."""
+    ahead = np.array([frame.left[1], -frame.left[0]])
+    return tuple(
+        (float(offset @ ahead), float(offset @ frame.left[:2]), float(height) - zero_m)
+        for offset, height in zip(
+            starts.positions[:, :2] - frame.origin[:2], starts.positions[:, 2], strict=True
+        )
+    )
 
 
 def _between(low_high: tuple[float, float], u: Array) -> Array:
