@@ -136,7 +136,7 @@ def clearance_figure(
     labels = [f"{planner_name(name)}, N = {counts[name]}" for name in planners]
     bottom, tall = 0.42, 1.8
     wide = max(COLUMN_IN, 2.0 * EDGE_IN + max(entry_width_in(words) for words in labels))
-    height = bottom + tall + 0.1 + legend_height_in(labels, wide - 2.0 * EDGE_IN)
+    height = bottom + tall + 0.2 + legend_height_in(labels, wide - 2.0 * EDGE_IN)
     page = Page.of_size(wide, height, credit)
     axes = page.axes(0.5, bottom, wide - 0.5 - 0.12, tall)
     lowest, highest = -0.5, 0.5
@@ -151,11 +151,11 @@ def clearance_figure(
         axes.plot(x, [*y, 1.0], drawstyle="steps-post", color=planner_colour(name), linewidth=1.2)
     if np.isfinite(np.asarray(rows["min_clearance_m"], dtype=float)).any():
         axes.axvline(0.0, color=BLACK, linewidth=0.8, linestyle=(0, (4, 2)), zorder=2)
-        axes.annotate("contact", (0.0, 1.0), xycoords=("data", "axes fraction"), xytext=(-3, 1),
-                      textcoords="offset points", ha="right", va="top", rotation=90)  # fmt: skip
+        axes.annotate("contact", (0.0, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 1),
+                      textcoords="offset points", ha="center", va="bottom")  # fmt: skip
     else:
         axes.text(0.5, 0.5, "no obstacles", transform=axes.transAxes, ha="center", color=GREY)
-    # Wide enough on the left for the word beside the line.
+    # Wide enough on the left for the word above the line.
     axes.set(xlim=(min(1.05 * lowest, -0.08 * highest), 1.02 * highest), ylim=(0.0, 1.0))
     axes.set_xlabel("Least clearance of a run (m)")
     axes.set_ylabel("Runs with less (%)")
