@@ -22,9 +22,8 @@ PIECE = 4
 FREE, LOADED, BALANCE = 0, 1, 2
 """Parts of a tape: the sweep without loads, with loads, and from here on the balance of each stage."""
 
-(ZERO, START, REFERENCE, LINEAR, LOADS, COST, PLAN, PUSH, GRADIENT, WEIGHED, PULLED, MOVED, LARGEST) = range(
-    13
-)
+ZERO, START, REFERENCE, LINEAR, LOADS, COST, PLAN = range(7)
+PUSH, GRADIENT, WEIGHED, PULLED, MOVED, LARGEST = range(7, 13)
 """Blocks of a plane: zero, of which two more rows take the first parts of long sums; the state now (12,) and
 references (N, 12); -Q ref (N, 12); rows times their multipliers, by state and input (N, 16); linear part of
 the optimal cost from the end of each stage on (N, 12); states (N, 12) and inputs (N, 4); the optimal cost's
