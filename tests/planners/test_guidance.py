@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -362,10 +363,15 @@ def fast(speed_mps: float) -> Problem:
     )  # fmt: skip
 
 
-def test_who_is_faster_looks_farther_and_goes_aside_in_time() -> None:
-    """At 10 m/s with the lengths of 2 m/s 39 of 40 missions hit the wall."""
+@pytest.mark.parametrize(("usual_mps", "hits"), [(SETTINGS.usual_mps, 0), (math.inf, 10)])
+def test_who_is_faster_looks_farther_and_goes_aside_in_time(
+    usual_mps: float, hits: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the lengths of slower formations, whatever the speed, all hit the wall at 10 m/s."""
+    monkeypatch.setattr("napf_mpc.planners.guidance.GuidanceSettings", partial(GuidanceSettings, usual_mps))
     flown = simulate(fast(10.0), "qp", seed=7600, runs=10).score
-    assert not flown.obstacle_contact.any()
+    assert np.count_nonzero(flown.obstacle_contact.any(-1)) == pytest.approx(hits, abs=1)
+    assert hits > 0 or not flown.obstacle_contact.any()
     assert flown.finished.all()
 
 
