@@ -77,7 +77,7 @@ class RangeErrors:
     ------
     ValueError
         A shape or a type does not fit, a direction is no unit vector, a sigma is not positive, a probability
-        not in [0, 1), or a prior is of a constellation that no range is of.
+        not in [0, 1), or a prior is of a constellation that no range is of while another has none.
     """
 
     line_of_sight: Array
@@ -120,12 +120,14 @@ class RangeErrors:
                 "np.unique(constellation, return_inverse=True)[1]"
             )
         present = np.unique(self.constellation).tolist()
-        for key in self.p_constellation:
-            if key not in present:
-                raise ValueError(
-                    f"p_constellation names {key!r}, must be one of constellation: "
-                    f"{', '.join(map(str, present))}"
-                )
+        strange = [key for key in self.p_constellation if key not in present]
+        # One that is out of view may have a prior; beside one in view that has none it is a slip.
+        if strange and not self.p_constellation.keys() >= set(present):
+            raise ValueError(
+                f"p_constellation names {strange[0]!r}, must be one of constellation: "
+                f"{', '.join(map(str, present))} (a prior of what is out of view is taken if all in view "
+                "have one, if need be of 0)"
+            )
         for name in ("sigma_m", "sigma_accuracy_m"):
             value = getattr(self, name)
             if value is not None and not ((value > 0.0) & np.isfinite(value)).all():

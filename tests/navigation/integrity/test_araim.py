@@ -132,6 +132,14 @@ def test_a_constellation_fault_leaves_all_its_satellites_out() -> None:
     assert "probability 0.01, must be below p_hmi = 0.002" in alone.reason
 
 
+def test_a_prior_of_what_is_out_of_view_changes_nothing() -> None:
+    given = protection_level(ranges(8, p_constellation={0: 1e-6, 1: 1e-3}), COUNTABLE)
+    alone = protection_level(ranges(8, p_constellation={0: 1e-6}), COUNTABLE)
+    assert given.available
+    assert given.horizontal_m == alone.horizontal_m
+    assert given.vertical_m == alone.vertical_m
+
+
 @pytest.mark.parametrize("count", [5, 4, 1])
 def test_fewer_satellites_than_clocks_and_four_more(count: int) -> None:
     sky = ranges(count, constellation=np.arange(count) % 2) if count > 1 else ranges(1)
