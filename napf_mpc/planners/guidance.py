@@ -21,10 +21,11 @@ from napf_mpc.jit import compiled_bare
 from napf_mpc.navigation.sigma_map import SigmaMap
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.navigation.tracks import Tracks
+from napf_mpc.planners.descent import ground_m
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import SolidBoxes, frame_of, solid_boxes
 from napf_mpc.planners.guide_search import plan_all, resample_all, resample_taut
-from napf_mpc.planners.guide_settings import ANY_HEIGHT, FINE, GuidanceSettings, search_of
+from napf_mpc.planners.guide_settings import FINE, GuidanceSettings, HeightRoom, search_of
 from napf_mpc.planners.guide_sky import NO_SKY, SkyField, sky_field
 from napf_mpc.planners.guide_traffic import TrafficPace, slowed
 from napf_mpc.planners.passes import everybody
@@ -103,7 +104,7 @@ class Guidance:
         self._open_sky_weight = problem.planner.open_sky_weight
         finish = np.array([problem.mission.length_m, 0.0, 0.0])
         ends = self._path.to_world(np.concatenate([self._slots, self._slots + finish]))
-        room = _height_room(problem.planner.altitude_m, ends)
+        room = _height_room(problem, ends[:, 2])
         radius = problem.vehicle.radius_m
         self._search = search_of(self.settings, margins, radius, self._open_sky_weight, room)
         self._clearance = Clearance(
@@ -112,7 +113,7 @@ class Guidance:
             problem.planner.contact_extra_m,
             problem.planner.contact_extra_sigmas,
         )
-        self._blind = search_of(self.settings, margins, radius, room_m=room)
+        self._blind = search_of(self.settings, margins, radius, room=room)
         stations = (self._search.lattice.stations - 1) * FINE + 1
         self._step_m = self._search.lattice.step_m / FINE
         self._bends = max(2, round(self.settings.bend_m / self._step_m) + 1)
@@ -327,12 +328,18 @@ class Guidance:
         return Guide(self.ahead_m, offset, pace, reason, breach, taut, loose, room)
 
 
-def _height_room(band_m: tuple[float, float] | None, places: Array) -> tuple[float, float]:
-    """How far all places (n, 3) may be left upwards and downwards within a band of heights [m]."""
-    if band_m is None:
-        return ANY_HEIGHT
-    heights = places[:, 2]
-    return band_m[1] - float(heights.max()), float(heights.min()) - band_m[0]
+def _height_room(problem: Problem, heights: Array) -> HeightRoom:
+    """Room above and below lanes that reach such heights (n,) [m].
+
+    Where neither the world nor an altitude band says what is below, and all lanes are above zero, the ground
+    is taken to be where people mean it to be, at zero. With lanes at zero or below nothing is known of it.
+    """
+    lowest, highest = float(heights.min()), float(heights.max())
+    ground, band = ground_m(problem), problem.planner.altitude_m
+    if band is None:
+        guessed = 0.0 if ground == -math.inf and lowest > 0.0 else ground
+        return HeightRoom(ground_m=lowest - guessed)
+    return HeightRoom(band[1] - highest, lowest - band[0], lowest - ground)
 
 
 # Codes as plain numbers, for the compiled loop.

@@ -305,18 +305,22 @@ def vertical_room(
     lane_up: float,
     reach: float,
     most: float,
-) -> tuple[bool, bool]:
-    """Whether it makes sense to go up, and down, past what was found.
+    least: float,
+) -> tuple[bool, bool, bool]:
+    """Whether it makes sense to go up, down past spheres, and down under what hangs in the air.
 
-    Up: something has a top that can be passed within ``most`` metres. Down only past spheres: what stands on
-    the ground has ground under it.
+    Up: something has a top that can be passed within ``most`` metres. Down past spheres: there is nothing
+    else, for what stands on the ground has ground under it. Under: something else has a bottom that can be
+    passed within ``least`` metres below the lane, where it is known that no ground is.
     """
     upwards = False
-    downwards = True
+    spheres = True
+    under = False
     for entry in range(count):
         i = found[entry]
         if solids.kind[i] != SPHERE:
-            downwards = False
+            spheres = False
+            under = under or lane_up - (boxes.low[i, 2] - reach) <= least
         if boxes.high[i, 2] + reach - lane_up <= most:
             upwards = True
-    return upwards, downwards and upwards
+    return upwards, spheres and upwards, under

@@ -43,6 +43,7 @@ class Lattice(NamedTuple):
     layer_m: float
     layers: int  # up past what stands on the ground; past spheres, half of ``sphere_layers`` each way
     sphere_layers: int
+    under: int  # down past what hangs in the air
 
 
 @compiled_bare

@@ -26,6 +26,7 @@ from napf_mpc.planners.guide_band import (
 )
 from napf_mpc.planners.guide_clearance import (
     COLUMNS,
+    ENDLESS_M,
     Frame,
     Sight,
     SolidBoxes,
@@ -62,6 +63,7 @@ class Search(NamedTuple):
     wide_prices: Prices  # of the coarser lattice
     margins: PassageMargins  # sigmas to keep
     radius_m: float
+    ground_room_m: float  # of the lowest lane above the ground, infinite if none is known [m]
     passes: int
     pass_m: float  # largest step of a pass [m]
     shared_gain: float  # the common draft must be cheaper by this factor
@@ -157,7 +159,9 @@ def make_scratch(uavs: int, fine: int, most: int, search: Search) -> Scratch:
     wide = search.wide
     stations = max(first.stations, wide.stations)
     cells = 2 * max(first.half, wide.half) + 1
-    layers = 1 + max(max(first.layers, first.sphere_layers), max(wide.layers, wide.sphere_layers))
+    layers = 1 + max(
+        first.layers + first.under, first.sphere_layers, wide.layers + wide.under, wide.sphere_layers
+    )
     return Scratch(
         np.empty((uavs, most), dtype=np.int64),
         np.empty(uavs, dtype=np.int64),
@@ -262,24 +266,32 @@ def plan_run(
     span = lattice.half * lattice.cell_m
     ahead = (lattice.stations - 1) * lattice.step_m
     found, count, reach = scratch.found, scratch.solid_count, scratch.reach
-    upwards = False
-    downwards = True
+    upwards = under = False
+    spheres = True
+    farthest = 0.0
     for i in range(uavs):
         reach[i] = largest_reach(covariance[i], search.margins.k, need)
+        farthest = max(farthest, reach[i])
+    to_ground = int(min(max(search.ground_room_m - farthest, 0.0), ENDLESS_M) / lattice.layer_m)
+    beneath = min(lattice.under, to_ground)
+    for i in range(uavs):
         count[i] = gather(
             boxes, first, stop, along[i] - 1.0, along[i] + ahead, lanes[i, 0] - span, lanes[i, 0] + span,
             reach[i], found[i],
         )  # fmt: skip
-        up, down = vertical_room(
-            solids, boxes, found[i], count[i], lanes[i, 1], reach[i], lattice.layers * lattice.layer_m
-        )
+        up, down, below_it = vertical_room(
+            solids, boxes, found[i], count[i], lanes[i, 1], reach[i], lattice.layers * lattice.layer_m,
+            beneath * lattice.layer_m,
+        )  # fmt: skip
         upwards = upwards or up
-        downwards = downwards and (down or count[i] == 0)
-    downwards = downwards and upwards and lattice.sphere_layers > 0
-    below = lattice.sphere_layers // 2 if downwards else 0
-    layers = 1
-    if upwards:
-        layers += 2 * below if downwards else lattice.layers
+        spheres = spheres and (down or count[i] == 0)
+        under = under or (below_it and beneath > 0)
+    below = min(lattice.sphere_layers // 2, to_ground)
+    if spheres and upwards and below > 0:
+        layers = 1 + 2 * below
+    else:
+        below = beneath if under else 0
+        layers = 1 + below + (lattice.layers if upwards else 0)
     mean = np.empty((fine, 2))
     sight = Sight(
         solids, frame, search.margins, search.radius_m, need, along, lanes, covariance, scratch.turned, reach,

@@ -36,6 +36,8 @@ class GuidanceSettings:
     """Highest climb over what stands on the ground [m]."""
     sphere_layers: int = 8
     """Layers to pass spheres, half of them up and half down."""
+    lowest_m: float = 10.0
+    """Deepest way under what hangs in the air, where it is known that no ground is [m]."""
     wide_m: float = 6.0
     """With radius, spare and margin beyond this, cells and layers are twice as large, and reach farther."""
     path: float = 8.5
@@ -145,13 +147,26 @@ class GuidanceSettings:
         )
 
 
-ANY_HEIGHT = math.inf, math.inf
-"""No limit to how far UAVs may climb and sink."""
+@dataclass(frozen=True)
+class HeightRoom:
+    """How far all UAVs may leave their lanes upwards and downwards."""
+
+    up_m: float = math.inf
+    """Within the altitude band [m]."""
+    down_m: float = math.inf
+    """The same."""
+    ground_m: float = math.inf
+    """To the ground, infinite if none is known [m]."""
 
 
-def _lattice(settings: GuidanceSettings, scale: int, room_m: tuple[float, float]) -> Lattice:
+ANY_HEIGHT = HeightRoom()
+
+
+def _lattice(settings: GuidanceSettings, scale: int, room: HeightRoom) -> Lattice:
     step, layer = settings.step_m * scale, settings.layer_m * scale
-    up, down = (max(0, math.floor(min(room, 1e6) / layer)) for room in room_m)
+    up, down = (max(0, math.floor(min(most, 1e6) / layer)) for most in (room.up_m, room.down_m))
+    # Nobody goes under anything where nothing says what is there.
+    lowest = 0.0 if min(room.down_m, room.ground_m) == math.inf else settings.lowest_m
     return Lattice(
         round(settings.ahead_m / step) + 1,
         step,
@@ -161,6 +176,7 @@ def _lattice(settings: GuidanceSettings, scale: int, room_m: tuple[float, float]
         layer,
         min(round(settings.highest_m / layer), up),
         min(settings.sphere_layers, 2 * min(up, down)),
+        min(round(lowest / layer), down),
     )
 
 
@@ -197,7 +213,7 @@ def search_of(
     margins: PassageMargins,
     radius_m: float,
     open_sky_weight: float = 0.0,
-    room_m: tuple[float, float] = ANY_HEIGHT,
+    room: HeightRoom = ANY_HEIGHT,
 ) -> Search:
     """Settings in the form that the compiled search reads.
 
@@ -211,17 +227,18 @@ def search_of(
         Of a UAV [m].
     open_sky_weight : float
         What a squared metre of a fix's variance costs, in squared metres of offset.
-    room_m : tuple of float
-        How far all UAVs may leave their lanes upwards, and downwards [m].
+    room : HeightRoom, optional
+        Limits to climbing and sinking.
     """
     return Search(
-        _lattice(settings, 1, room_m),
-        _lattice(settings, 2, room_m),
+        _lattice(settings, 1, room),
+        _lattice(settings, 2, room),
         settings.wide_m,
         _prices(settings, 1, open_sky_weight),
         _prices(settings, 2, open_sky_weight),
         margins,
         radius_m,
+        room.ground_m,
         settings.passes,
         settings.pass_m,
         settings.shared_gain,

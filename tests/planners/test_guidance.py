@@ -64,14 +64,17 @@ def guidance(
 
 def follow(
     made: Guidance, *, until_m: float = 110.0, time_limit_s: float = 110.0, sigma: float = 0.5,
-    measured: bool = False,
+    measured: bool = False, origin: Array | float = 0.0,
 ) -> tuple[list[Array], list[Guide]]:  # fmt: skip
-    """UAVs that follow the guide as well as a vehicle of 2 m/s can: places and guides every 0.1 s."""
+    """UAVs that follow the guide as well as a vehicle of 2 m/s can: places and guides every 0.1 s.
+
+    Places are from the origin, where the mission starts.
+    """
     place = advanced(8.0)
     covariance, trusted = isotropic(sigma), np.ones((1, 4), dtype=bool)
     places, guides = [], []
     for step in range(round(10 * time_limit_s)):
-        guide = made.step(place[None], covariance, trusted, 0.1 * step, measured=measured)
+        guide = made.step((place + origin)[None], covariance, trusted, 0.1 * step, measured=measured)
         places.append(place)
         guides.append(guide)
         if place[:, 0].min() >= until_m or (guide.reason == Passage.NO_PASSAGE).all():
@@ -343,6 +346,67 @@ def test_spheres_are_passed_above_where_the_band_leaves_no_room_below() -> None:
     heights = np.concatenate([guide.offset[0, ..., 1].ravel() for guide in guides])
     assert heights.max() > 4.0
     assert heights.min() >= -0.1
+
+
+SLAB = Box((60.0, 0.0, 30.0 - 2.0), (10.0, 400.0, 60.0))
+"""Too wide to go round and too high to climb; its bottom is 2 m below a start at zero."""
+
+
+@pytest.mark.parametrize(
+    ("start_m", "band", "under"),
+    [
+        (12.0, None, True),  # ten metres of air below, by the heights themselves
+        (5.0, None, False),  # 3 m of air: less than the margins to slab and ground
+        (0.0, None, False),  # nothing says where the ground is
+        (0.0, (-20.0, 20.0), True),
+        (0.0, (-3.0, 20.0), False),
+    ],
+)
+def test_what_hangs_in_the_air_is_passed_beneath_where_no_ground_is(
+    start_m: float, band: tuple[float, float] | None, under: bool
+) -> None:
+    mission = {"kind": "formation", "length_m": 150.0, "start_m": (0.0, 0.0, start_m)}
+    planner = {} if band is None else {"altitude_m": band}
+    slab = Box((60.0, 0.0, SLAB.centre_m[2] + start_m), SLAB.size_m)
+    made = guidance([slab], mission=mission, planner=planner)
+    origin = np.array([0.0, 0.0, start_m])
+    places, guides = follow(made, origin=origin)
+    assert (places[-1][:, 0].min() >= 110.0) == under
+    assert (Passage.NO_PASSAGE in reasons(guides)) != under
+    assert clearance(made, [place + origin for place in places]) > K_SIGMA - SETTINGS.squeeze_m
+    lowest = min(place[:, 2].min() for place in places)
+    floor = -math.inf if band is None and start_m <= 0.0 else -start_m + K_SIGMA if band is None else band[0]
+    assert lowest >= floor
+    assert (lowest < SLAB.centre_m[2] - 30.0 - K_SIGMA + SETTINGS.squeeze_m) == under
+
+
+def test_what_stands_is_not_passed_beneath_where_something_hangs() -> None:
+    """A skyway between two towers: under it, and not through the ground under a tower."""
+    ground = 30.0
+    shapes: list[Shape] = [
+        Box((60.0, 0.0, 48.0), (8.0, 60.0, 40.0)),  # its bottom 2 m below the lanes
+        Box((60.0, 60.0, 30.0), (8.0, 60.0, 60.0)),
+        Box((60.0, -60.0, 30.0), (8.0, 60.0, 60.0)),
+    ]
+    made = guidance(shapes, mission={"kind": "formation", "length_m": 150.0, "start_m": (0.0, 0.0, ground)})
+    origin = np.array([0.0, 0.0, ground])
+    places, _ = follow(made, origin=origin)
+    assert places[-1][:, 0].min() >= 110.0
+    beside = [place[i] for place in places for i in range(4) if abs(place[i, 0] - 60.0) < 4.0]
+    assert max(abs(place[1]) for place in beside) < 28.0
+    assert max(place[2] for place in beside) < -2.0 - RADIUS
+    assert clearance(made, [place + origin for place in places]) > K_SIGMA - SETTINGS.squeeze_m
+
+
+@pytest.mark.parametrize(("start_m", "dives"), [(0.0, True), (20.0, True), (4.0, False)])
+def test_spheres_are_passed_above_where_the_ground_leaves_no_room_below(start_m: float, dives: bool) -> None:
+    spheres: list[Shape] = [Sphere((60.0, y, start_m + 1.0), 4.0) for y in (-12.0, -4.0, 4.0, 12.0)]
+    made = guidance(spheres, mission={"kind": "formation", "length_m": 150.0, "start_m": (0.0, 0.0, start_m)})
+    origin = np.array([0.0, 0.0, start_m])
+    places, _ = follow(made, origin=origin)
+    assert places[-1][:, 0].min() >= 110.0
+    assert (min(place[:, 2].min() for place in places) < -2.0) == dives
+    assert clearance(made, [place + origin for place in places]) > K_SIGMA - SETTINGS.squeeze_m
 
 
 def fast(speed_mps: float) -> Problem:
