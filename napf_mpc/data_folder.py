@@ -63,10 +63,6 @@ def find_data_file(name: str, data_folder: Path | None) -> Path:
     try:
         root = folder.resolve()
         path = (root / name).resolve()
-        if not path.is_relative_to(root):
-            raise DataError(
-                f'data file "{shown_text(name, 120)}" leads out of the data folder {folder}: not allowed'
-            )
         found = path.is_file()
         is_folder = path.is_dir()
     except (OSError, ValueError, RuntimeError) as error:  # too long a name, a loop of links
@@ -74,6 +70,11 @@ def find_data_file(name: str, data_folder: Path | None) -> Path:
         raise DataError(
             f'data file "{shown_text(name, 120)}" cannot be looked up in {folder}: {reason}'
         ) from error
+    if not path.is_relative_to(root):
+        raise DataError(
+            f'data file "{shown_text(name, 120)}" leads out of the data folder {folder}: not allowed; '
+            "copy it there"
+        )
     if found:
         return path
     if is_folder:

@@ -58,6 +58,7 @@ HOMES = {
     "pymap3d": {
         "navigation/recorded.py",
         "navigation/readers/smartloc.py",
+        "navigation/rtklib_layout.py",
         "navigation/sky.py",
         "navigation/pseudoranges.py",
         "world/city.py",

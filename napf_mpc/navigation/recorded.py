@@ -11,6 +11,7 @@ import pymap3d
 from numpy.typing import NDArray
 
 from napf_mpc.errors import DataError
+from napf_mpc.navigation.clocks import CLOCKS, gps_time_s
 from napf_mpc.navigation.rtklib import PosTrack, numbered_lines, read_rtklib_pos
 from napf_mpc.words import shown_text
 
@@ -182,28 +183,45 @@ def errors_against_truth(solution: PosTrack, truth: PosTrack) -> ErrorLog:
     Parameters
     ----------
     solution, truth : PosTrack
-        What the receiver computed, with its covariance, and what was true, in the same time system.
+        What the receiver computed, with its covariance, and what was true. GPS time, UTC and JST are brought
+        to one another; other clocks must be the same.
 
     Raises
     ------
     DataError
-        Different time systems, fewer than two epochs in common, or a solution without a covariance.
+        Clocks that cannot be compared, heights of different kinds, fewer than two epochs in common, or a
+        solution without a covariance.
     """
     names = f"{solution.source} against {truth.source}"
-    if solution.time_system != truth.time_system:
+    solution_s, truth_s = _same_clock(names, solution, truth)
+    if solution.heights != truth.heights:
         raise DataError(
-            f"{names}: times in {solution.time_system} and in {truth.time_system}, must be the same system"
+            f"{names}: {solution.heights} and {truth.heights} heights, which are tens of metres apart; "
+            "write both as ellipsoidal"
         )
-    row = _nearest(solution.time_s, truth.time_s)
-    available = np.abs(solution.time_s[row] - truth.time_s) <= MATCH_S
+    row = _nearest(solution_s, truth_s)
+    available = np.abs(solution_s[row] - truth_s) <= MATCH_S
     if (matches := np.count_nonzero(available)) < 2:
-        raise DataError(f"{names}: {matches} epochs in common, at least 2 are needed")
-    period_s = sample_period(solution.time_s)
-    steps = (truth.time_s - truth.time_s[np.argmax(available)]) / period_s
+        raise DataError(
+            f"{names}: {matches} epochs in common, at least 2 are needed (from {solution_s[0]:.3f} to "
+            f"{solution_s[-1]:.3f} s and from {truth_s[0]:.3f} to {truth_s[-1]:.3f} s)"
+        )
+    period_s = sample_period(solution_s)
+    steps = (truth_s - truth_s[np.argmax(available)]) / period_s
     kept = available | (np.abs(steps - np.round(steps)) * period_s <= MATCH_S)
-    row, time, true = row[kept], truth.time_s[kept], truth.geodetic[kept]
+    row, time, true = row[kept], truth_s[kept], truth.geodetic[kept]
     error = np.stack(pymap3d.geodetic2enu(*solution.geodetic[row].T, *true.T), -1)
     return ErrorLog(names, time - time[0], available[kept], error, solution.covariance[row])
+
+
+def _same_clock(names: str, solution: PosTrack, truth: PosTrack) -> tuple[Array, Array]:
+    """Times of both on one clock; left as they are if that is the same already."""
+    systems = solution.time_system, truth.time_system
+    if systems[0] == systems[1]:
+        return solution.time_s, truth.time_s
+    if not set(systems) <= set(CLOCKS):
+        raise DataError(f"{names}: times in {systems[0]} and in {systems[1]}, which cannot be compared")
+    return gps_time_s(solution.time_s, systems[0]), gps_time_s(truth.time_s, systems[1])
 
 
 def _nearest(sorted_values: Array, wanted: Array) -> NDArray[np.int64]:

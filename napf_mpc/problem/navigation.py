@@ -99,7 +99,8 @@ class Recorded(_NavigationBase):
     format: Literal["auto", "pos", "nmea", "ubx", "ulog", "smartloc"] = "auto"
     """Format of the file; ``auto`` goes by its suffix."""
     truth_file: str | None = Field(None, max_length=1000)
-    """Path of the truth that positions are compared with, in the same time system; a ``.csv`` needs none."""
+    """Path of the truth that positions are compared with, by the same clock or both by GPS time, UTC or JST;
+    a ``.csv`` needs none."""
     truth_format: Literal["auto", "pos", "nmea", "ubx", "ulog", "smartloc"] = "auto"
     """Format of the truth's file."""
     part: Literal["all", "first_half", "second_half"] = "all"

@@ -275,11 +275,16 @@ def test_a_problem_replays_the_errors_between_two_logs(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.covariance[0, 0, 0], 16.0)
 
 
-def test_clocks_of_different_kinds_are_not_mixed(tmp_path: Path) -> None:
+def test_nmea_in_utc_is_the_truth_of_ubx_in_gps_time(tmp_path: Path) -> None:
+    """18 s apart since 2017; a truth that cannot be brought to GPS time is refused."""
     ubx_log(tmp_path / "rover.ubx", 3.0)
-    written(tmp_path, zda("06:04:12", 11), gga("06:04:12", PLACE), name="truth.nmea")
-    config = Recorded(kind="recorded", file="rover.ubx", truth_file="truth.nmea")
-    with pytest.raises(DataError, match="times in GPST and in UTC, must be the same system"):
+    lines = [zda("06:04:12", 11), *(gga(f"06:04:{s}", PLACE) for s in range(12, 16))]
+    written(tmp_path, *lines, name="truth.nmea")
+    log = load_error_log(Recorded(kind="recorded", file="rover.ubx", truth_file="truth.nmea"), tmp_path)
+    np.testing.assert_allclose(log.error, [[3.0, 0.0, 0.0]] * 4, atol=0.03)
+    written(tmp_path, *lines[1:], name="dateless.nmea")
+    config = Recorded(kind="recorded", file="rover.ubx", truth_file="dateless.nmea")
+    with pytest.raises(DataError, match="times in GPST and in UTC, no date, which cannot be compared"):
         load_error_log(config, tmp_path)
 
 
