@@ -264,6 +264,9 @@ class StreetCanyon(_WorldBase):
     )(ordered)
 
 
+_Projected = Annotated[float, Field(ge=-1e8, le=1e8)]  # northings of UTM go to 1e7, zoned eastings to 6e7
+
+
 class City(_WorldBase):
     """Buildings from a file: GeoJSON footprints with heights, or CityJSON LoD1."""
 
@@ -275,7 +278,7 @@ class City(_WorldBase):
     """Latitude of the local frame's origin (GeoJSON; by default the middle of the buildings)."""
     origin_longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0)] | None = None
     """Longitude of the local frame's origin (GeoJSON)."""
-    origin_m: Point3 | None = None
+    origin_m: tuple[_Projected, _Projected, _Projected] | None = None
     """Origin in the file's own projected coordinates (CityJSON; by default the middle of the buildings)."""
     height_property: str = Field("height_m", min_length=1, max_length=200)
     """GeoJSON property that holds the height above ground."""

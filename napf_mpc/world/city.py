@@ -9,6 +9,7 @@ silence is one flown into.
 from __future__ import annotations
 
 import math
+import re
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
@@ -37,6 +38,12 @@ from napf_mpc.world.obstacles import ObstacleSet
 __all__ = ["Buildings", "load_city", "read_cityjson", "read_geojson"]
 
 _FAR_SIDE_M = -1e6
+# WGS 84 and what lies within two metres of it: ETRS89, NAD83, JGD2000, JGD2011, KGD2002, CGCS2000, SIRGAS
+# 2000, GDA94, GDA2020, NZGD2000; of each the plane and the three-dimensional system.
+_LIKE_WGS84 = {
+    "CRS84", "CRS84h", "4326", "4979", "4258", "4937", "4269", "4957", "4612", "4947", "6668", "6667", "6697",
+    "4737", "4927", "4490", "4480", "4674", "4989", "4283", "4939", "7844", "7843", "4167", "4959",
+}  # fmt: skip
 
 
 def load_city(world: City, data_folder: Path | None = None) -> ObstacleSet:
@@ -140,6 +147,7 @@ def read_geojson(
     document = read_json(path)
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         raise DataError(f'{path}: not a GeoJSON FeatureCollection ("type" must be "FeatureCollection")')
+    _check_wgs84(path, document.get("crs"))
     features = document.get("features")
     if not isinstance(features, list) or not features:
         raise DataError(f'{path}: "features" must be a list with at least one building')
@@ -172,6 +180,17 @@ def read_geojson(
                 footprint = shapely.make_valid(shapely.Polygon(local[0], local[1:]))
                 blocks.append(Block(name, footprint, 0.0, height))
     return cut_into_prisms(path, blocks, origin_deg, min_height_m, radius_m)
+
+
+def _check_wgs84(path: Path, system: Any) -> None:
+    """Refuse a file that names a projected system, as GeoJSON before RFC 7946 might."""
+    properties = system.get("properties") if isinstance(system, dict) else None
+    name = properties.get("name") if isinstance(properties, dict) else None
+    if system is not None and (not isinstance(name, str) or re.split("[:/]", name)[-1] not in _LIKE_WGS84):
+        raise DataError(
+            f"{path}: crs {shown(name if name is not None else system)} is not WGS-84; GeoJSON must be in "
+            "longitude, latitude of EPSG:4326: convert it"
+        )
 
 
 def _feature_name(index: int, feature: Any) -> str:

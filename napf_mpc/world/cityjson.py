@@ -30,6 +30,7 @@ _BUILDINGS = ("Building", "BuildingPart")
 _GEOGRAPHIC = ("4326", "4979", "CRS84")
 # EPSG/0/7415, EPSG::7415, EPSG:28992+5709: perhaps a version, then a code or some.
 _EPSG_CODES = re.compile(r"EPSG[:/](?:[^:/+]*[:/])?(\d{1,9}(?:\+\d{1,9})*)", re.IGNORECASE)
+_LEAST_WIDTH_M = 0.5
 _FEET = re.compile(r"\b(?:ft|ftUS|foot|feet)\b", re.IGNORECASE)
 # How many lists lie around a surface (a list of rings) in a geometry's boundaries.
 _SURFACE_DEPTH = {
@@ -53,10 +54,11 @@ def read_cityjson(
     Only objects of type Building and BuildingPart are read. The file's coordinates are **assumed to be
     projected and metric**, as in EPSG:7415, since such a file does not say its unit but by the name of its
     system. Refused are the commonest geographic systems (EPSG:4326 and 4979, CRS84) and all of EPSG that are
-    in feet. Other geographic systems, other units (yards, chains), systems of other registers (such as ESRI)
-    and files that name none are **not** known, and read as metres. Of an object's geometries the one of
-    LoD1 is taken if there is one, else the lowest above LoD0. Its footprint is the union of its faces seen
-    from above, its base the lowest and its top the highest of its vertices, so that the block holds the
+    in feet, and files whose widest building is less than 0.5 wide, as in degrees. Other units (yards,
+    chains), systems of other registers (such as ESRI) and files that name none are **not** known, and read
+    as metres. Of an object's geometries the one of LoD1 is taken if there is one, else the lowest above LoD0;
+    an object without one stands for its parts, which must be there. Its footprint is the union of its faces
+    seen from above, its base the lowest and its top the highest of its vertices, so that the block holds the
     building whatever its roof is.
 
     Parameters
@@ -97,7 +99,7 @@ def read_cityjson(
         where = f"{path}: {name}"
         if not isinstance(item, dict) or not isinstance(item.get("type"), str):
             raise DataError(f'{path}: object {shown(key)} has no "type"')
-        if item["type"] in _BUILDINGS and not _stands_for_parts(item):
+        if item["type"] in _BUILDINGS and not _stands_for_parts(where, item, objects):
             surfaces = _building_surfaces(where, item)
             indices = np.unique(np.concatenate([ring for surface in surfaces for ring in surface]))
             if indices[-1] >= len(vertices):
@@ -112,6 +114,7 @@ def read_cityjson(
         upper = np.max([corners.max(axis=0) for _, _, corners in solids], axis=0)
         x, y, _ = (0.5 * (lower + upper)).tolist()
         origin_m = (x, y, float(lower[2]))
+    _check_width(path, [corners for _, _, corners in solids])
     local = vertices - np.array(origin_m)
     blocks = []
     for name, surfaces, corners in solids:
@@ -139,8 +142,22 @@ def _check_metric(path: Path, document: dict[str, Any]) -> None:
         )
 
 
+def _check_width(path: Path, solids: list[Array]) -> None:
+    """Refuse degrees, whatever the file calls its system: no building is a degree wide, each is a metre."""
+    widest = max(float(np.ptp(corners[:, :2], axis=0).max()) for corners in solids)
+    if widest < _LEAST_WIDTH_M:
+        raise DataError(
+            f"{path}: its widest building measures {widest:.3g}, as in degrees; coordinates must be metric: "
+            "convert it to a projected system"
+        )
+
+
 def _cityjson_vertices(path: Path, document: dict[str, Any]) -> Array:
     vertices = point_array(f'{path}: "vertices"', document.get("vertices"), (3,))
+    # Since 1.1 vertices are whole numbers of some unit, and without it they are not metres.
+    whole = (vertices == np.round(vertices)).all() and "transform" not in document
+    if whole and not str(document.get("version", "1.0")).startswith(("0.", "1.0")):
+        raise DataError(f'{path}: version {shown(document["version"])} needs "transform"')
     if "transform" in document:
         transform = document["transform"]
         if not isinstance(transform, dict):
@@ -156,9 +173,29 @@ def _cityjson_vertices(path: Path, document: dict[str, Any]) -> Array:
     return vertices
 
 
-def _stands_for_parts(item: dict[str, Any]) -> bool:
-    """Whether a building has no geometry of its own because its parts have it."""
-    return not item.get("geometry") and bool(item.get("children"))
+def _stands_for_parts(where: str, item: dict[str, Any], objects: dict[str, Any]) -> bool:
+    """Whether a building has no body of its own because its parts have it.
+
+    A footprint (LoD0) is no body; models of whole countries have it at the building, the rest at its parts.
+    """
+    children = item.get("children")
+    geometries = item.get("geometry", [])
+    if not children or not isinstance(children, list) or not isinstance(geometries, list):
+        return False
+    if any(not isinstance(each, dict) or _lod(where, each) >= 1.0 for each in geometries):
+        return False
+    found = [objects.get(child) if isinstance(child, str) else None for child in children]
+    for child, part in zip(children, found, strict=True):
+        if not isinstance(part, dict):
+            raise DataError(
+                f"{where}: has no geometry of LoD1 or more, and its part {shown(child)} is not there"
+            )
+    if not any(part.get("type") == "BuildingPart" for part in found if part is not None):
+        raise DataError(
+            f"{where}: has no geometry of LoD1 or more, and none of its children is a BuildingPart; only "
+            "objects of type Building and BuildingPart are read"
+        )
+    return True
 
 
 def _building_surfaces(where: str, item: dict[str, Any]) -> list[list[NDArray[np.int64]]]:

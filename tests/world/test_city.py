@@ -237,6 +237,27 @@ def test_unusable_geometries_are_named(tmp_path, geometry, named):
         read_geojson(write(tmp_path, town))
 
 
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("urn:ogc:def:crs:OGC:1.3:CRS84", True),
+        ("urn:ogc:def:crs:EPSG::6668", True),
+        ("EPSG:4326", True),
+        ("urn:ogc:def:crs:EPSG::6677", False),  # Japan's plane IX, metres about a point in Tokyo's region
+        ("urn:ogc:def:crs:EPSG::25832", False),
+        (7, False),
+    ],
+)
+def test_a_crs_that_is_not_in_degrees_is_refused(tmp_path, name, read):
+    town = small_town() | {"crs": {"type": "name", "properties": {"name": name}}}
+    path = write(tmp_path, town)
+    if read:
+        assert read_geojson(path).names == read_geojson(write(tmp_path, small_town(), "b.geojson")).names
+    else:
+        with pytest.raises(DataError, match=r"town\.geojson: crs .* is not WGS-84"):
+            read_geojson(path)
+
+
 # -------------------------------------------------------------------------------------------- CityJSON
 
 
@@ -368,6 +389,79 @@ def test_a_cityjson_file_in_metres_or_of_unknown_unit_is_read(tmp_path, system):
     town = cube_town()
     town["metadata"] = {"referenceSystem": system}
     assert len(read_cityjson(write(tmp_path, town, "town.json")).prisms) == 2
+
+
+def national_town():
+    """As models of whole countries are made: the footprint at the building, bodies at its part."""
+    town = cube_town()
+    court_object(town).update(geometry=court_object(town)["geometry"][:1], children=["court-0"])
+    town["CityObjects"]["court-0"] = {
+        "type": "BuildingPart",
+        "parents": ["court"],
+        "geometry": cube_town()["CityObjects"]["court"]["geometry"][1:],
+    }
+    return town
+
+
+def test_a_building_with_a_footprint_alone_is_read_by_its_parts(tmp_path):
+    found = read_cityjson(write(tmp_path, national_town(), "town.json"))
+    plain = read_cityjson(write(tmp_path, cube_town(), "town.json"))
+    assert sorted(found.names) == ["building 'court-0'", "building 'part'"]
+    assert sorted(footprint(prism).area for prism in found.prisms) == sorted(
+        footprint(prism).area for prism in plain.prisms
+    )
+    assert found.origin == plain.origin
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda town: town["CityObjects"].pop("court-0"), "court.*its part 'court-0' is not there"),
+        (lambda town: town["CityObjects"].pop("part"), "whole.*its part 'part' is not there"),
+        (
+            lambda town: town["CityObjects"]["court-0"].update(type="BuildingStorey"),
+            "court.*none .* BuildingPart",
+        ),
+        (lambda town: court_object(town).update(children=[]), "court.*no geometry of LoD1"),
+        (lambda town: court_object(town).update(children=[{}]), "court.*part {} is not there"),
+    ],
+)
+def test_no_building_is_left_out_because_its_parts_are_missing(tmp_path, change, named):
+    town = national_town()
+    change(town)
+    with pytest.raises(DataError, match=rf"town\.json.*{named}"):
+        read_cityjson(write(tmp_path, town, "town.json"))
+
+
+def test_degrees_are_refused_whatever_the_system_is_called(tmp_path):
+    """EPSG:6697 is that of Japan's city models: latitude, longitude, height."""
+    town = cube_town()
+    town["metadata"] = {"referenceSystem": "http://www.opengis.net/def/crs/EPSG/0/6697"}
+    town["transform"] = {"scale": [1e-8, 1e-8, 0.001], "translate": [35.69, 139.69, 2.0]}
+    with pytest.raises(
+        DataError, match=r"town\.json: its widest building measures 0\.0003, as in degrees; .*convert"
+    ):
+        read_cityjson(write(tmp_path, town, "town.json"))
+
+
+def test_whole_numbers_are_no_metres_since_version_1_1(tmp_path):
+    for version in ("1.1", "2.0"):
+        town = cube_town()
+        town["version"] = version
+        town.pop("transform")
+        with pytest.raises(DataError, match=rf"town\.json: version '{version}' needs \"transform\""):
+            read_cityjson(write(tmp_path, town, "town.json"))
+
+
+@pytest.mark.parametrize("zone_m", [(32_691_000.0, 5_334_000.0, 515.0), (2_683_000.0, 1_247_000.0, 400.0)])
+def test_a_problem_may_lie_in_any_projected_system(tmp_path, zone_m):
+    """Munich with the zone before its easting, and Zurich: both beyond a million metres."""
+    town = cube_town()
+    town["transform"]["translate"] = list(zone_m)
+    write(tmp_path, town, "town.json")
+    world = City.model_validate({"kind": "city", "file": "town.json", "origin_m": zone_m})
+    found = load_city(world, tmp_path)
+    assert found.scene_start.tolist() == [0, 2]
 
 
 # ------------------------------------------------------------------------------------------ both files
