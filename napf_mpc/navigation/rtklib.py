@@ -106,7 +106,7 @@ def read_rtklib_pos(path: Path | str) -> PosTrack:
         if layout is None:
             raise DataError(f"{place}: no header line (% GPST latitude(deg) ...) before it")
         fields = layout.fields(line)
-        needed = 3 + max(layout.places)
+        needed = 3 + max(*layout.places, layout.quality or 0)
         if len(fields) < needed:
             raise DataError(f"{place}: {len(fields)} fields, the header promises at least {needed}")
         if layout.quality is not None and fields[2 + layout.quality] == "0":
