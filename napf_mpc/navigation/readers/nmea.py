@@ -117,8 +117,8 @@ class _Clock:
         return self.days * DAY_S + second
 
     def date(self, message: Any) -> None:
-        """Learn the date of the first midnight, once."""
-        if self.system == "UTC" or not isinstance(message.time, dt.time):
+        """Learn the date of the first midnight, then how many days a gap has taken."""
+        if not isinstance(message.time, dt.time):
             return
         if message.msgID == "ZDA":
             day = message.year, message.month, message.day
@@ -129,7 +129,11 @@ class _Clock:
         if not all(isinstance(part, int) for part in day) or day[0] < 1980:
             return
         self.count(message.time)
-        self.offset_s = unix_seconds(*day) - GPS_EPOCH_UNIX_S - self.days * DAY_S
+        midnight_s = unix_seconds(*day) - GPS_EPOCH_UNIX_S
+        if self.system == "UTC":
+            self.days = round((midnight_s - self.offset_s) / DAY_S)
+            return
+        self.offset_s = midnight_s - self.days * DAY_S
         self.system = "UTC"
 
 

@@ -275,6 +275,16 @@ def test_a_problem_replays_the_errors_between_two_logs(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.covariance[0, 0, 0], 16.0)
 
 
+def test_nmea_after_a_gap_of_days_is_dated_by_its_date(tmp_path: Path) -> None:
+    lines = [zda("10:00:00", 11), gga("10:00:00", PLACE), gga("10:00:01", PLACE)]
+    lines += [zda("11:00:00", 13), gga("11:00:00", PLACE)]  # two days and an hour later
+    track = read_nmea(written(tmp_path, *lines))
+    np.testing.assert_allclose(track.time_s - GPS_DAY_S, [36_000.0, 36_001.0, 2 * 86_400.0 + 39_600.0])
+    back = [*lines, zda("12:00:00", 12), gga("12:00:00", PLACE)]
+    with pytest.raises(DataError, match="time goes back by 82800 s"):
+        read_nmea(written(tmp_path, *back))
+
+
 def test_nmea_in_utc_is_the_truth_of_ubx_in_gps_time(tmp_path: Path) -> None:
     """18 s apart since 2017; a truth that cannot be brought to GPS time is refused."""
     ubx_log(tmp_path / "rover.ubx", 3.0)
