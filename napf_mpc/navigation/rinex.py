@@ -1,9 +1,10 @@
-"""Reader of RINEX 3 navigation files: broadcast ephemerides of GPS, Galileo and QZSS."""
+"""Reader of RINEX navigation files (2 to 4): broadcast ephemerides of GPS, Galileo and QZSS."""
 
 from __future__ import annotations
 
 import datetime as dt
 import math
+from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,6 +21,7 @@ MAX_RECORDS = 200_000
 MAX_BYTES = 100_000_000
 _LETTERS = {"G": "GPS", "E": "Galileo", "J": "QZSS"}
 _LINES = 8
+_MESSAGES = ("LNAV", "INAV", "FNAV")
 _GPS_EPOCH = dt.datetime(1980, 1, 6)
 _INAV = 0b101  # bits of Galileo's "data sources": I/NAV of E1-B, I/NAV of E5b-I
 
@@ -45,7 +47,8 @@ def read_rinex_navigation(path: Path | str) -> Ephemerides:
     Parameters
     ----------
     path : Path or str
-        RINEX 3 navigation file, mixed or of one system.
+        RINEX navigation file of version 2 (GPS), 3 or 4, mixed or of one system. Of version 4 the messages
+        LNAV and INAV are read, which have the form of version 3.
 
     Returns
     -------
@@ -72,47 +75,69 @@ def _read_cached(path: Path, _changed_ns: int, _size: int) -> Ephemerides:
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
     lines = enumerate(text.splitlines(), start=1)
-    _check_header(path, next(lines, (0, ""))[1])
-    in_header = True
+    version = _version(path, next(lines, (0, ""))[1])
+    if not any(line[60:].strip() == "END OF HEADER" for _, line in lines):
+        raise DataError(f'{path}: has no line "END OF HEADER"; not a RINEX navigation file')
     records: dict[tuple[str, float], tuple[str, dict[str, float], float]] = {}
-    block: list[str] = []
-    start = 0
-
-    def close() -> None:
-        if not block or block[0][0] not in _LETTERS:
-            return
+    for start, block in _blocks(path, version, lines):
+        if block[0][0] not in _LETTERS:
+            continue
         name, values, toc = _record(f"{path}, line {start}", block)
         if block[0][0] != "E" or int(values["source"]) & _INAV:
             records.setdefault((name, values["week"] * 604_800.0 + values["toe"]), (name, values, toc))
         if len(records) > MAX_RECORDS:
             raise DataError(f"{path}: more than {MAX_RECORDS} records")
-
-    for number, line in lines:
-        if in_header:
-            in_header = line[60:].strip() != "END OF HEADER"
-            continue
-        if line[:1].isalpha():
-            close()
-            block, start = [line], number
-        elif line.strip() and block:
-            block.append(line)
-        elif line.strip():
-            raise DataError(f"{path}, line {number}: {shown_text(line)} belongs to no record")
-    if in_header:
-        raise DataError(f'{path}: has no line "END OF HEADER"; not a RINEX 3 navigation file')
-    close()
     if not records:
         raise DataError(f"{path}: holds no ephemeris of {', '.join(SYSTEMS[:-1])} or {SYSTEMS[-1]}")
     return _table(list(records.values()))
 
 
-def _check_header(path: Path, line: str) -> None:
+def _version(path: Path, line: str) -> int:
     if line[60:].strip() != "RINEX VERSION / TYPE" or line[20:21] != "N":
-        raise DataError(f"{path}, line 1: {shown_text(line)} is not the head of a RINEX navigation file")
-    if not line[:20].strip().startswith("3."):
         raise DataError(
-            f"{path}, line 1: RINEX version {shown_text(line[:20].strip())}, must be 3; convert the file"
+            f"{path}, line 1: {shown_text(line)} is not the head of a RINEX navigation file of GPS or of "
+            "several systems"
         )
+    words = line[:20].strip()
+    if words[:1] not in ("2", "3", "4") or words[1:2] not in ("", "."):
+        raise DataError(
+            f"{path}, line 1: RINEX version {shown_text(words)}, must be 2, 3 or 4; convert the file"
+        )
+    return int(words[0])
+
+
+def _blocks(path: Path, version: int, lines: Iterator[tuple[int, str]]) -> Iterator[tuple[int, list[str]]]:
+    """Records of a file, each with the number of its first line, its lines in the form of version 3."""
+    start, block = 0, [""]
+    other = False  # a message of version 4 that is of another form
+    for number, line in lines:
+        if version == 4 and line.startswith(">"):
+            words = line[1:].split()
+            other = len(words) < 3 or words[0] != "EPH" or words[2] not in _MESSAGES
+            continue
+        if other or not line.strip():
+            continue
+        if line[:1].isalpha() if version > 2 else line[:3].strip():
+            if block[0]:
+                yield start, block
+            start, block = number, [line if version > 2 else _head_of_2(f"{path}, line {number}", line)]
+        elif block[0]:
+            block.append(line if version > 2 else " " + line)
+        else:
+            raise DataError(f"{path}, line {number}: {shown_text(line)} belongs to no record")
+    if block[0]:
+        yield start, block
+
+
+def _head_of_2(place: str, line: str) -> str:
+    """First line of a record of version 2 as version 3 writes it: satellite, whole year, whole seconds."""
+    try:
+        satellite, year, month, day, hour, minute = (int(line[at : at + 2]) for at in (0, 3, 6, 9, 12, 15))
+        seconds = int(float(line[17:22]))
+    except (ValueError, OverflowError):
+        raise DataError(f"{place}: {shown_text(line[:22])} is not a satellite, date and time") from None
+    year += 2000 if year < 80 else 1900
+    return f"G{satellite:02d} {year} {month:02d} {day:02d} {hour:02d} {minute:02d} {seconds:02d}{line[22:]}"
 
 
 def _record(place: str, lines: list[str]) -> tuple[str, dict[str, float], float]:

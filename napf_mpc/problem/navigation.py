@@ -125,7 +125,8 @@ class Gnss(_NavigationBase):
     kind: Literal["gnss"]
     """Kind of navigation error."""
     file: str | None = Field(None, min_length=1, max_length=1000)
-    """RINEX 3 navigation file under the data folder; by default a nominal GPS and Galileo constellation."""
+    """RINEX navigation file (2, 3, 4) under the data folder; by default a nominal constellation of GPS and
+    Galileo."""
     systems: Annotated[tuple[Literal["GPS", "Galileo", "QZSS"], ...], Field(min_length=1, max_length=3)] = (
         "GPS",
         "Galileo",

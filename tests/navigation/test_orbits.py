@@ -83,12 +83,46 @@ def test_fnav_records_and_other_systems_are_passed_over(tmp_path: Path) -> None:
     assert read_rinex_navigation(written(tmp_path, text)).name.tolist() == ["E02", "J01"]
 
 
+def as_version_2(text: str) -> str:
+    """The same records of GPS with two digits for satellite and year, one column to the left."""
+    lines = []
+    for line in text.replace("E", "D").splitlines():
+        if line.startswith(" "):
+            lines.append(line[1:])
+            continue
+        clock = " ".join(f"{int(word):2d}" for word in line[9:20].split())
+        lines.append(f"{int(line[1:3]):2d} {line[6:8]} {clock}{float(line[20:23]):5.1f}{line[23:]}")
+    return HEADER.replace("3.02           N: GNSS", "2.11           N: GPS ") + "\n".join(lines) + "\n"
+
+
+def test_versions_2_and_4_hold_the_same_records(tmp_path: Path) -> None:
+    rows = [record("G01"), record("G09", e=0.01, m0=-1.5, toe=180_000.0), record("G32", sqrt_a=5154.25)]
+    rows = [row.replace("2023 07 11 00 00 00", f"2023 07 11 {h:02d} 59 44") for h, row in enumerate(rows)]
+    three = read_rinex_navigation(written(tmp_path, HEADER + "".join(rows)))
+    strange = "> STO G01 LNAV\n    2023 07 11\n> EPH G01 CNAV\n" + record("G01", sqrt_a=5000.0)
+    four = HEADER.replace("3.02", "4.01") + strange
+    four += "".join(f"> EPH {row[:3]} LNAV\n{row}" for row in rows) + "> ION G01 LNAV\n    1.0\n"
+    for text in (as_version_2("".join(rows)), four):
+        other = read_rinex_navigation(written(tmp_path, text))
+        assert other.name.tolist() == three.name.tolist()
+        for key in ("toc_s", "toe_s", "af0", "sqrt_a", "e", "m0", "healthy", "accuracy_m"):
+            np.testing.assert_array_equal(getattr(other, key), getattr(three, key))
+        moment = np.array([DAY + 7200.0])
+        np.testing.assert_array_equal(other.positions(moment), three.positions(moment))
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "line 1"),
         ("not a file\n", "is not the head of a RINEX navigation file"),
-        (HEADER.replace("3.02", "2.11") + record(), "RINEX version 2.11, must be 3"),
+        (HEADER.replace("3.02", "5.00") + record(), "RINEX version 5.00, must be 2, 3 or 4"),
+        (HEADER.replace("3.02", "30.2") + record(), "RINEX version 30.2, must be 2, 3 or 4"),
+        (HEADER.replace("3.02", "2.11") + record(), "line 3: G01 .* is not a satellite, date and time"),
+        (
+            HEADER.replace("N: GNSS NAV", "G: GLONASS N"),
+            "line 1: .* not the head of a RINEX navigation file of GPS",
+        ),
         (HEADER.splitlines()[0] + "\n" + record(), "END OF HEADER"),
         (HEADER, "holds no ephemeris"),
         (HEADER + "\n".join(record().splitlines()[:5]) + "\n", "line 3: a record of 5 lines, must have 8"),
