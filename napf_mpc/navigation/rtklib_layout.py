@@ -35,6 +35,7 @@ _SIGMAS = {
 _OTHER_NAMES = {"sdue(m)": "sdun(m)"}
 _FIRST_COLUMNS = "|".join(re.escape(columns[0]) for columns in _POSITIONS.values())
 _SEPARATOR = re.compile(rf"\s*(\S?)\s*(?:{_FIRST_COLUMNS})")
+_HALF_A_DIGIT_M = 0.5e-4
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d*)?")
 
 
@@ -135,6 +136,19 @@ def reference_position(place: str, line: str) -> Array:
     raise DataError(f"{place}: {shown_text(line)} is no reference position (latitude, longitude, height)")
 
 
+def _without_rounding(covariance: Array, sigmas: Array) -> Array:
+    """Nearest covariances where four decimals made of one what is none, as they do with millimetres.
+
+    A sigma that is off by half a digit d puts its square off by 2 sigma d, three of them an eigenvalue by 6.
+    What is off by more is left as it is, for whoever uses it to refuse.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    rounding = 6.0 * _HALF_A_DIGIT_M * np.abs(sigmas).max(axis=1)
+    rounded = (values[:, 0] < 0.0) & (values[:, 0] >= -rounding)
+    kept = np.einsum("nik,nk,njk->nij", vectors, np.maximum(values, 0.0), vectors)
+    return np.where(rounded[:, None, None], kept, covariance)
+
+
 def geodetic_and_covariance(
     layout: Layout, position: Array, sigmas: Array, base: Array | None
 ) -> tuple[Array, Array]:
@@ -154,6 +168,7 @@ def geodetic_and_covariance(
     """
     a, b, c, ab, bc, ca = np.copysign(sigmas**2, sigmas).T
     covariance = np.stack([np.stack(row, -1) for row in ((a, ab, ca), (ab, b, bc), (ca, bc, c))], -2)
+    covariance = _without_rounding(covariance, sigmas)
     if layout.kind in ("deg", "dms"):
         swap = [1, 0, 2]  # the file has north first
         # Of north, east, up the cross terms are ne, eu, un: 12, 23, 31.

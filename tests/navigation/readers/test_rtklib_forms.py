@@ -224,6 +224,30 @@ def test_a_truth_needs_no_standard_deviations(tmp_path: Path) -> None:
     assert errors_against_truth(whole, bare).available.all()
 
 
+def test_four_decimals_of_millimetres_are_a_covariance(tmp_path: Path) -> None:
+    """As an RTK log has them: sigmas of 1 mm, axes that hang together, an eigenvalue below zero."""
+    exact = np.array([[0.69, 0.88, 1.34], [0.88, 1.46, 2.11], [1.34, 2.11, 3.35]]) * 1e-6
+    assert np.linalg.eigvalsh(exact)[0] > 0.0
+    printed = np.round(np.sqrt(exact), 4) ** 2
+    low, _, high = np.linalg.eigvalsh(printed)
+    assert low < -1e-3 * high
+    made = Made(PLACES["Nagoya"])
+    made.covariance = np.tile(exact, (EPOCHS, 1, 1))
+
+    def four_decimals(lines: list[str]) -> list[str]:
+        rows = [line.split() for line in lines[5:-1]]
+        cut = [[*row[:7], *(f"{float(word):.4f}" for word in row[7:13]), *row[13:]] for row in rows]
+        return [*lines[:5], *(" ".join(row) for row in cut), ""]
+
+    track = read_rtklib_pos(changed(written(tmp_path / "a.pos", made), four_decimals))
+    assert errors_against_truth(track, track).available.all()
+    np.testing.assert_allclose(track.covariance, made.covariance, atol=4e-7)
+    path = changed(tmp_path / "a.pos", lambda lines: [line.replace("0.0015", "0.0040") for line in lines])
+    wrong = read_rtklib_pos(path)
+    with pytest.raises(DataError, match="a matrix that is no covariance"):
+        errors_against_truth(wrong, wrong)
+
+
 def moved(old: str, new: str, at: int = 6) -> Callable[[list[str]], list[str]]:
     def change(lines: list[str]) -> list[str]:
         assert old in lines[at]
