@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _MAX_SLOTS = 2_000_000
+_OFF_GRID = 0.25  # periods that a step may be off a whole number of them
 
 
 def load_error_log(config: Recorded, data_folder: Path | None) -> ErrorLog:
@@ -229,8 +230,7 @@ class _Table:
 def _table(log: ErrorLog, with_gaps: bool, with_height: bool) -> _Table:
     fixes = np.flatnonzero(log.available)
     if with_gaps:
-        period_s = sample_period(log.time_s)
-        slots = np.round((log.time_s - log.time_s[0]) / period_s)
+        period_s, slots = _even_grid(log)
         n = int(slots[-1]) + 1
         if n > _MAX_SLOTS:
             raise DataError(f"{log.source}: {n} steps of {period_s:g} s with its gaps, at most {_MAX_SLOTS}")
@@ -252,6 +252,32 @@ def _table(log: ErrorLog, with_gaps: bool, with_height: bool) -> _Table:
     values, vectors = np.linalg.eigh(covariance)
     factor = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return _Table(period_s, here, error, covariance, factor, (twice[n:] - last).astype(np.float64) * period_s)
+
+
+def _even_grid(log: ErrorLog) -> tuple[float, Array]:
+    """Period of an even grid, and the step (n,) of it at which each epoch lies, no two at one.
+
+    Where two would fall on one, multiples of the usual step, or of a part of it, are counted step by step:
+    clocks jitter, and the usual step is two seconds where fixes seldom come a second apart. Times that do not
+    fit have no grid on which a gap could be told.
+
+    Raises
+    ------
+    DataError
+        The times fit no grid.
+    """
+    steps, usual_s = np.diff(log.time_s), sample_period(log.time_s)
+    slots = np.round((log.time_s - log.time_s[0]) / usual_s)
+    if (np.diff(slots) > 0.0).all():
+        return usual_s, slots
+    for period_s in (usual_s / parts for parts in range(1, 6)):
+        counts = np.round(steps / period_s)
+        if (counts > 0.0).all() and (np.abs(steps / period_s - counts) < _OFF_GRID).all():
+            return period_s, np.concatenate([[0.0], np.cumsum(counts)])
+    raise DataError(
+        f"{log.source}: its epochs lie {steps.min():g} to {steps.max():g} s apart, on no even grid, so that "
+        'gaps cannot be told; set navigation.gaps = "close"'
+    )
 
 
 def _slot(time_s: float, period_s: float) -> int:

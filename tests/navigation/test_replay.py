@@ -283,3 +283,41 @@ def test_nagoya_outages_are_as_frequent_as_in_the_log(data_folder: Path):
     errors = position_errors(cfg, 1, range(3), 2, 1230.0, data_folder)
     available = np.array([errors.fix(k).available for k in range(1231)])  # the whole ring once
     np.testing.assert_array_equal(available.sum(axis=0), 550)
+
+
+def log_at(times: list[float]) -> ErrorLog:
+    n = len(times)
+    error = np.arange(1.0, n + 1.0)[:, None] * np.ones(3)
+    return ErrorLog("made up", np.array(times), np.ones(n, dtype=bool), error, np.tile(np.eye(3), (n, 1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("steps", "period_s", "gaps"),
+    [
+        ([2, 2, 3, 2, 4, 1, 2, 2, 3, 2, 2, 4, 2, 3, 2, 2, 2], 1.0, 23),  # seldom a fix a second after another
+        (
+            100 * [1, 1, 1.1, 0.9, 1, 1.04, 0.9, 1, 1.15, 1.05, 1, 1, 3, 1.06],
+            1.0,
+            200,
+        ),  # jitter, and a true gap
+        ([0.2, 0.3, 0.2, 0.2, 0.4, 0.2], 0.2, 2),
+    ],
+)
+def test_no_fix_of_an_uneven_log_is_lost(steps: list[float], period_s: float, gaps: int):
+    times = np.concatenate([[0.0], np.cumsum(steps)])
+    errors = flown(config(gaps="outage", rate_hz=10.0), log_at(times.tolist()), [0.0], [[0.0]], 10)
+    assert errors.table.period_s == pytest.approx(period_s)
+    assert errors.table.available.sum() == len(times)
+    assert (~errors.table.available).sum() == gaps
+    replayed = errors.table.error[errors.table.available, 0]
+    np.testing.assert_array_equal(replayed, np.arange(1.0, len(times) + 1.0))
+
+
+def test_gaps_of_a_log_on_no_grid_are_not_guessed():
+    times = np.cumsum([0.0, 1.0, 0.031, 1.7, 0.44, 0.05, 2.2, 0.6, 0.013, 1.1]).tolist()
+    with pytest.raises(
+        DataError, match=r'made up: .* 0\.013 to 2\.2 s apart.*set navigation\.gaps = "close"'
+    ):
+        flown(config(gaps="outage"), log_at(times), [0.0], [[0.0]], 10)
+    closed = flown(config(gaps="close"), log_at(times), [0.0], [[0.0]], 10)
+    assert closed.table.available.all()
