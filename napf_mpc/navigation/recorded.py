@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 MATCH_S = 0.005
 """Largest time between a solution and the truth that it is compared with: 5 mm at 1 m/s."""
 _MAX_ERROR_M = 1e6
+_MAX_USUAL_ERROR_M = 1000.0
 _MAX_TIME_S = 1e10
 _MIN_STEP_S = 0.005
 _MAX_VARIANCE_M2 = 1e12
@@ -189,8 +190,8 @@ def errors_against_truth(solution: PosTrack, truth: PosTrack) -> ErrorLog:
     Raises
     ------
     DataError
-        Clocks that cannot be compared, heights of different kinds, fewer than two epochs in common, or a
-        solution without a covariance.
+        Clocks that cannot be compared, heights of different kinds, fewer than two epochs in common, positions
+        too far apart to be of one drive, or a solution without a covariance.
     """
     names = f"{solution.source} against {truth.source}"
     solution_s, truth_s = _same_clock(names, solution, truth)
@@ -211,6 +212,12 @@ def errors_against_truth(solution: PosTrack, truth: PosTrack) -> ErrorLog:
     kept = available | (np.abs(steps - np.round(steps)) * period_s <= MATCH_S)
     row, time, true = row[kept], truth_s[kept], truth.geodetic[kept]
     error = np.stack(pymap3d.geodetic2enu(*solution.geodetic[row].T, *true.T), -1)
+    usual_m = float(np.median(np.linalg.norm(error[available[kept]], axis=-1)))
+    if usual_m > _MAX_USUAL_ERROR_M:
+        raise DataError(
+            f"{names}: positions are {usual_m:.0f} m apart (median), more than {_MAX_USUAL_ERROR_M:g} m: "
+            "these are not the same drive at the same time; check the files and their clocks"
+        )
     return ErrorLog(names, time - time[0], available[kept], error, solution.covariance[row])
 
 

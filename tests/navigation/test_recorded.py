@@ -264,6 +264,14 @@ def test_truth_of_another_day_or_time_system_is_refused(tmp_path: Path):
         errors_against_truth(read_rtklib_pos(rover), unknown)
 
 
+def test_a_truth_of_another_place_is_refused(tmp_path: Path):
+    rover, truth = solution_and_truth(tmp_path)
+    lines = truth.read_text().replace(f"{LAT:.9f}", f"{LAT + 0.01:.9f}").splitlines()
+    elsewhere = write(tmp_path, "elsewhere.pos", lines)
+    with pytest.raises(DataError, match=r"elsewhere\.pos: positions are 11\d\d m apart \(median\)"):
+        errors_against_truth(read_rtklib_pos(rover), read_rtklib_pos(elsewhere))
+
+
 def test_a_solution_that_reports_no_sigma_is_refused(tmp_path: Path):
     _, truth = solution_and_truth(tmp_path)
     track = read_rtklib_pos(truth)
