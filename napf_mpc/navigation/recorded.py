@@ -88,7 +88,8 @@ class ErrorLog:
             self._refuse(beyond, f"{what} that is not finite or beyond {limit:g}")
         variances = np.einsum("nii->ni", self.covariance)
         self._refuse(
-            used & ~(variances > 0.0).all(-1), "a variance that is not positive (zero means unknown)"
+            used & ~(variances > 0.0).all(-1),
+            "a variance that is not positive (zero means unknown); leave it out or say its sigma",
         )
         error = np.where(used[:, None], self.error, 0.0)
         covariance = np.where(used[:, None, None], self.covariance, 0.0)
