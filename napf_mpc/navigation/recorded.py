@@ -199,7 +199,7 @@ def errors_against_truth(solution: PosTrack, truth: PosTrack) -> ErrorLog:
     if solution.heights != truth.heights:
         raise DataError(
             f"{names}: {solution.heights} and {truth.heights} heights, which are tens of metres apart; "
-            "write both as ellipsoidal"
+            "write both alike"
         )
     row = _nearest(solution_s, truth_s)
     available = np.abs(solution_s[row] - truth_s) <= MATCH_S

@@ -34,7 +34,8 @@ def read_nmea(path: Path | str) -> PosTrack:
     The horizontal covariance is that of GST's error ellipse, whose semi-major axis :math:`\sigma_1` lies
     ``orient`` degrees clockwise from north, :math:`\sigma_2` across: with unit vectors u and v along them,
     :math:`\sigma_1^2 u u^T + \sigma_2^2 v v^T`. A receiver that leaves the ellipse empty has its latitude and
-    longitude sigmas taken. Height is that above sea level plus the geoid's separation.
+    longitude sigmas taken. Height is that above sea level plus the geoid's separation;
+    of a receiver that leaves that empty it is ``geodetic``.
 
     Parameters
     ----------
@@ -55,6 +56,7 @@ def read_nmea(path: Path | str) -> PosTrack:
     path = log_file(path)
     clock = _Clock()
     fixes: list[tuple[float, list[float]]] = []
+    separated: set[bool] = set()
     reports: dict[float, Array] = {}
     for number, line in numbered_lines(path):
         if not line.startswith(("$", "!")):
@@ -77,11 +79,18 @@ def read_nmea(path: Path | str) -> PosTrack:
             separation = message.sep if message.sep != "" else 0.0
             if "" in values:
                 raise DataError(f"{place}: GGA claims a fix but leaves its position empty")
+            separated.add(message.sep != "")
+            if len(separated) > 1:
+                raise DataError(
+                    f"{place}: some GGA give the geoid's separation and some leave it empty, so that heights "
+                    "do not go together"
+                )
             fixes.append((time_s, [float(values[0]), float(values[1]), float(values[2]) + float(separation)]))
     times = [clock.offset_s + time_s for time_s, _ in fixes]
     unknown = np.zeros((3, 3))
     covariances = [reports.get(time_s, unknown) for time_s, _ in fixes]
-    return checked_track(path, clock.system, times, [position for _, position in fixes], covariances)
+    heights = "geodetic" if separated == {False} else "ellipsoidal"
+    return checked_track(path, clock.system, times, [position for _, position in fixes], covariances, heights)
 
 
 def _parsed(place: str, line: str) -> Any:

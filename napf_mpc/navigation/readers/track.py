@@ -49,6 +49,7 @@ def checked_track(
     time_s: Sequence[float],
     geodetic: Sequence[Sequence[float]],
     covariance: Sequence[Array],
+    heights: str = "ellipsoidal",
 ) -> PosTrack:
     """Track of epochs with a fix, in the order of the file.
 
@@ -63,9 +64,11 @@ def checked_track(
     time_s : sequence of float
         [s].
     geodetic : sequence of 3 floats
-        WGS-84 latitude and longitude [deg], ellipsoidal height [m].
+        WGS-84 latitude and longitude [deg], height [m].
     covariance : sequence of array, shape (3, 3)
         As reported, east, north, up [m^2]; zero where none was given.
+    heights : str
+        What heights count from: ``ellipsoidal`` or ``geodetic``.
 
     Raises
     ------
@@ -99,4 +102,4 @@ def checked_track(
             f"{_MAX_VARIANCE_M2:g} m^2"
         )
     kept = np.concatenate([[True], steps > 0.0])
-    return PosTrack(str(path), time_system, times[kept], places[kept], matrices[kept])
+    return PosTrack(str(path), time_system, times[kept], places[kept], matrices[kept], heights)

@@ -285,6 +285,26 @@ def test_nmea_after_a_gap_of_days_is_dated_by_its_date(tmp_path: Path) -> None:
         read_nmea(written(tmp_path, *back))
 
 
+def test_nmea_without_the_geoids_separation_has_heights_above_the_sea(tmp_path: Path) -> None:
+    def without(line: str) -> str:
+        body = line[1:].split("*")[0].split(",")
+        text = ",".join([*body[:11], "", *body[12:]])
+        checksum = 0
+        for byte in text.encode():
+            checksum ^= byte
+        return f"${text}*{checksum:02X}"
+
+    bare = [zda("06:04:12", 11), *(without(gga(f"06:04:{s}", PLACE)) for s in range(12, 16))]
+    track = read_nmea(written(tmp_path, *bare))
+    assert track.heights == "geodetic"
+    np.testing.assert_allclose(track.geodetic[:, 2], PLACE[2] - 37.5, atol=0.01)
+    ubx_log(tmp_path / "rover.ubx", 3.0)
+    with pytest.raises(DataError, match="ellipsoidal and geodetic heights"):
+        errors_against_truth(read_ubx(tmp_path / "rover.ubx"), track)
+    with pytest.raises(DataError, match=r"line 6: some GGA give the geoid's separation"):
+        read_nmea(written(tmp_path, *bare, gga("06:04:16", PLACE)))
+
+
 def test_nmea_in_utc_is_the_truth_of_ubx_in_gps_time(tmp_path: Path) -> None:
     """18 s apart since 2017; a truth that cannot be brought to GPS time is refused."""
     ubx_log(tmp_path / "rover.ubx", 3.0)
