@@ -21,6 +21,7 @@ MAX_RECORDS = 200_000
 MAX_BYTES = 100_000_000
 _LETTERS = {"G": "GPS", "E": "Galileo", "J": "QZSS"}
 _LINES = 8
+_WEEK_S = 604_800.0
 _MESSAGES = ("LNAV", "INAV", "FNAV")
 _GPS_EPOCH = dt.datetime(1980, 1, 6)
 _INAV = 0b101  # bits of Galileo's "data sources": I/NAV of E1-B, I/NAV of E5b-I
@@ -84,7 +85,7 @@ def _read_cached(path: Path, _changed_ns: int, _size: int) -> Ephemerides:
             continue
         name, values, toc = _record(f"{path}, line {start}", block)
         if block[0][0] != "E" or int(values["source"]) & _INAV:
-            records.setdefault((name, values["week"] * 604_800.0 + values["toe"]), (name, values, toc))
+            records.setdefault((name, values["week"] * _WEEK_S + values["toe"]), (name, values, toc))
         if len(records) > MAX_RECORDS:
             raise DataError(f"{path}: more than {MAX_RECORDS} records")
     if not records:
@@ -157,7 +158,15 @@ def _record(place: str, lines: list[str]) -> tuple[str, dict[str, float], float]
     except (ValueError, TypeError):
         raise DataError(f"{place}: {shown_text(head[3:23])} is not a date and time") from None
     name = head[0] + head[1:3].replace(" ", "0")
-    return name, values, gps_seconds(epoch)
+    toc_s = gps_seconds(epoch)
+    off = round((values["week"] * _WEEK_S + values["toe"] - toc_s) / _WEEK_S)
+    # Some writers give the week of the transmission, which may be that before, or the satellite's ten bits.
+    if abs(off) > 1 and off % 1024:
+        raise DataError(
+            f"{place}: week = {values['week']:g} is {abs(off)} weeks off its date, {head[3:23].strip()}"
+        )
+    values["week"] -= off
+    return name, values, toc_s
 
 
 def _number(place: str, key: str, text: str) -> float:
@@ -181,7 +190,7 @@ def _table(records: list[tuple[str, dict[str, float], float]]) -> Ephemerides:
         name=names,
         system=np.array([SYSTEMS.index(_LETTERS[name[0]]) for name in names], dtype=np.int64),
         toc_s=np.array([toc for _, _, toc in records]),
-        toe_s=column("week") * 604_800.0 + column("toe"),
+        toe_s=column("week") * _WEEK_S + column("toe"),
         healthy=column("health") == 0.0,
         **{key: column(key) for key in _PLACES if key not in ("toe", "source", "week", "health")},
     )

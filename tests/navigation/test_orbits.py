@@ -83,6 +83,15 @@ def test_fnav_records_and_other_systems_are_passed_over(tmp_path: Path) -> None:
     assert read_rinex_navigation(written(tmp_path, text)).name.tolist() == ["E02", "J01"]
 
 
+@pytest.mark.parametrize("week", [2269.0, 2271.0, 2270.0 - 2 * 1024.0])
+def test_a_week_that_is_not_that_of_its_time_follows_the_date(tmp_path: Path, week: float) -> None:
+    right = read_rinex_navigation(written(tmp_path, HEADER + record()))
+    other = read_rinex_navigation(written(tmp_path, HEADER + record(week=week)))
+    np.testing.assert_array_equal(other.toe_s, right.toe_s)
+    with pytest.raises(DataError, match="line 3: week = 2200 is 70 weeks off its date, 2023 07 11 00 00 00"):
+        read_rinex_navigation(written(tmp_path, HEADER + record(week=2200.0)))
+
+
 def as_version_2(text: str) -> str:
     """The same records of GPS with two digits for satellite and year, one column to the left."""
     lines = []
