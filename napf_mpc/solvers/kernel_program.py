@@ -52,8 +52,13 @@ SOFTEST = 1e-3
 """A slack whose quadratic price is below this part of its rows' stiffness is solved by proximal steps."""
 SOFTEST_ALONE = 1e-9
 """The same for a slack of one row without a linear price."""
+SLOWEST = 0.01
+"""No slack is given more of a quadratic price than this part of the stiffness of its softest row."""
+MOST_GIVEN = 1e5
+"""Nor more than this times its linear price, or one: a slack of one unit would drown in it."""
 PROXIMAL_STEPS = 60
-"""Proximal steps at most; each leaves at most a thousandth of the error."""
+"""Proximal steps at most; each leaves at most a thousandth of the error if the rows that share a slack are
+equally stiff, and at most half of it whatever they are."""
 LOOK = 32
 """Guessed multipliers looked at together: most are zero."""
 GUESSED = 1e-9
@@ -79,6 +84,8 @@ class Room(NamedTuple):
     """(soft groups,) last slack of a group that needs proximal steps."""
     extra: Array
     """(soft groups,) what those add to its quadratic price; zero for all others."""
+    give: Array
+    """(soft groups,) largest Gram entry of its rows with bounds: -1 if none has any, -2 if not asked for."""
     was_open: NDArray[np.bool_]
     """(soft groups,) groups open before a proximal step."""
     row: Index
@@ -93,7 +100,7 @@ class Room(NamedTuple):
         plane, exact = np.zeros(shape), np.zeros(shape)
         return cls(
             np.zeros(plane.size), plane.reshape(-1), plane, exact.reshape(-1), exact, np.zeros(6),
-            np.zeros(soft), np.zeros(soft), np.zeros(soft, dtype=np.bool_),
+            np.zeros(soft), np.zeros(soft), np.zeros(soft), np.zeros(soft, dtype=np.bool_),
             np.zeros(members, dtype=np.int64), np.zeros(members),
         )  # fmt: skip
 
@@ -196,23 +203,30 @@ def proximal(
     for g in range(soft):
         work.w1[g], work.w2[g] = table.price[u, W1, g], table.price[u, W2, g]
     for g in range(soft):
-        room.previous[g], room.extra[g] = 0.0, 0.0
+        room.previous[g], room.extra[g], room.give[g] = 0.0, 0.0, -2.0
     for f in range(len(program.places.wide)):
         shelf, lonely, near = program.places.shelf[f], program.places.lonely[f], 0
         if shelf == table.shelves.shape[2]:
             continue
         for k in range(stages):
-            size = 0.0
+            # An upper bound of the row's own Gram entry first, by Cauchy and Schwarz: it is cheap.
+            size, give = 0.0, 0.0
             for d in range(WIDTH):
-                size += table.plane[u, d, f, k] * table.plane[u, d, f, k]
+                square = table.plane[u, d, f, k] * table.plane[u, d, f, k]
+                size, give = size + square, give + square * maps.give[program.places.axis[f, d], k]
             # A linear price, or a row that shares the slack, would drown in a slack so soft. A row alone
             # without one yields, that is all.
             alone = lonely & (table.shelves[u, W1, shelf, k] == 0.0)
-            least = SOFTEST_ALONE if alone else SOFTEST
+            most, least = (size * maps.softest, SOFTEST_ALONE) if alone else (give, SOFTEST)
             finite = (table.plane[u, LOW, f, k] > -np.inf) | (table.plane[u, HIGH, f, k] < np.inf)
-            # An upper bound of the row's own Gram entry first: it is cheap.
-            near += (table.shelves[u, W2, shelf, k] * size * 4.0 * maps.softest < least) & finite
-        if near == 0:
+            near += (table.shelves[u, W2, shelf, k] * most * WIDTH < least) & finite
+        if near > 0:
+            for k in range(stages):
+                room.give[shelf * stages + k] = -1.0
+    for f in range(len(program.places.wide)):
+        shelf, lonely = program.places.shelf[f], program.places.lonely[f]
+        # Softness is that of all rows which share a slack.
+        if shelf == table.shelves.shape[2] or room.give[shelf * stages] < -1.0:
             continue
         for r in range(f * stages, f * stages + stages):
             g, give = program.places.group[r], 0.0
@@ -224,10 +238,17 @@ def proximal(
                     pair = maps.kernel[program.places.signal[d, r], program.places.signal[e, r]]
                     give += program.number[u, d, r] * program.number[u, e, r] * pair
             least = SOFTEST_ALONE if alone else SOFTEST
-            softest = least / give if give > 0.0 else 1.0
-            room.extra[g] = max(room.extra[g], softest - table.price[u, W2, g])
-            any_soft = any_soft or room.extra[g] > 0.0
+            room.give[g] = max(room.give[g], give)
+            if give > 0.0:
+                room.extra[g] = max(room.extra[g], least / give - table.price[u, W2, g])
     for g in range(soft):
+        if room.give[g] > 0.0:
+            most = MOST_GIVEN * max(1.0, table.price[u, W1, g])
+            room.extra[g] = min(room.extra[g], min(SLOWEST / room.give[g], most))
+        elif room.give[g] == 0.0:
+            # Rows without coefficients have nothing that could drown: any price does.
+            room.extra[g] = max(0.0, 1.0 - table.price[u, W2, g])
+        any_soft = any_soft or room.extra[g] > 0.0
         work.w2[g] = table.price[u, W2, g] + room.extra[g]
     return any_soft
 
@@ -274,13 +295,24 @@ def guess(
     return True
 
 
+@compiled_bare
+def needed(program: Program, work: WorkingSet, group: int) -> float:
+    """Slack that a group's rows need where the last look found them; no more than it has."""
+    slack, stages, most = max(0.0, work.slack[group]), work.miss.shape[1], -np.inf
+    for f in range(len(program.places.shelf)):
+        if program.places.shelf[f] == group // stages:
+            most = max(most, work.miss[f, group % stages])
+    return float(max(0.0, slack + min(0.0, most)))
+
+
 @compiled_apart
 def again(program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room) -> bool:
     """Take a proximal step: prices from the slacks reached; return whether they had moved."""
     moved = False
     for g in range(table.price.shape[2]):
         if room.extra[g] > 0.0:
-            reached = max(0.0, work.slack[g])
+            # A slack beyond what its rows need would sink at the pace of its own price, next to nothing.
+            reached = needed(program, work, g) if work.total[g] == 0.0 else max(0.0, work.slack[g])
             off = room.extra[g] * abs(reached - room.previous[g])
             moved = moved or off > CLOSE * max(1.0, table.price[u, W1, g])
             room.previous[g] = reached
@@ -335,11 +367,13 @@ def certify(
             product = max(product, mult * slack)
         work.slack[g] = slack
     out[2], out[3] = off, largest
-    missed, size = out[0], out[1]
+    missed, size, lost = out[0], out[1], lanes.lost[lane]
     for f in range(len(program.places.wide)):
         look(program, work, f, room.exact_plane)
         for k in range(n):
             miss, value = work.miss[f, k], abs(work.value[f, k])
+            # NaN fails every comparison.
+            lost += not value < np.inf
             missed, size = miss if miss > missed else missed, value if value > size else size
     out[0], out[1] = missed, size
     largest = out[5]
@@ -353,7 +387,7 @@ def certify(
         else:
             y[at, program.places.y_high[row]] += mult
     out[4], out[5] = product, largest
-    worst = 0.0 if lanes.lost[lane] == 0 else np.inf
+    worst = 0.0 if lost == 0 else np.inf
     for e in range(0, 6, 2):
         relative = out[e] / max(1.0, out[e + 1])
         worst = max(worst, relative) if relative < np.inf else np.inf

@@ -52,8 +52,10 @@ class SignalMaps(NamedTuple):
     """(13 N,) place of each signal in state and input, see :data:`TARGETS`."""
     stage: Small
     """(13 N,) its stage."""
+    give: Array
+    """(13, N) diagonal of the kernel, in its order: how easily each signal is moved."""
     softest: float
-    """Largest diagonal entry of the kernel: no unit row is easier to move."""
+    """Its largest entry: no unit row is easier to move."""
 
 
 def signal_maps(model: HorizonModel) -> SignalMaps:
@@ -99,6 +101,7 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
         place,
         np.repeat(TARGETS[order], n).astype(np.uint32),
         np.tile(np.arange(n), len(TARGETS)).astype(np.uint32),
+        np.ascontiguousarray(np.diag(kernel)[at]).reshape(len(TARGETS), n),
         float(np.diag(kernel).max()),
     )
 

@@ -218,6 +218,47 @@ def test_a_slack_that_costs_nothing_holds_nothing() -> None:
     np.testing.assert_allclose(result.states, certified(one()).states, atol=1e-6)
 
 
+@pytest.mark.parametrize("signal", ["position", "velocity", "attitude"])
+@pytest.mark.parametrize("size", [0.0, 1e-3, 1e-2, 0.1, 1.0])
+@pytest.mark.parametrize(("w1", "w2"), [(0.0, 0.05), (0.0, 1e-3), (1.0, 0.0), (50.0, 0.01)])
+def test_rows_of_any_size_share_a_soft_slack(signal: str, size: float, w1: float, w2: float) -> None:
+    """Rows that hardly move, or have no coefficients at all, do not slow down those beside them."""
+    jac = np.random.default_rng(0).normal(size=(6, 3))
+    jac[3:] *= size
+    bound, prices = everywhere([-1.0] * 6), (everywhere([w1]), everywhere([w2]))
+    certified(one(LinearRows(signal, everywhere(jac), None, bound, *prices, shared_slack=True)))
+
+
+@pytest.mark.parametrize(
+    ("signal", "w1", "w2"),
+    [("position", 300.0, 1e-4), ("velocity", 0.0, 1e-6), ("attitude", 0.0, 1e-5), ("attitude", 300.0, 1e-5)],
+)
+@pytest.mark.parametrize("shared", [False, True])
+def test_slacks_between_soft_and_stiff(signal: str, w1: float, w2: float, shared: bool) -> None:
+    """What is soft for a row is measured by its own signal: an attitude gives much less than a position."""
+    model, jac = hover_model(*MODELS["fine"]), np.random.default_rng(0).normal(size=(4, 3))
+    n, slacks = model.stages, 1 if shared else 4
+    prices = (everywhere([w] * slacks, n) for w in (w1, w2))
+    block = LinearRows(
+        signal, everywhere(jac, n), None, everywhere([-0.3] * 4, n), *prices, shared_slack=shared
+    )
+    certified(one(block, model=model))
+
+
+@pytest.mark.parametrize("size", [1e-5, 1e-8, 1e-12, 1e-160])
+def test_a_row_with_next_to_no_coefficients_takes_its_slack(size: float) -> None:
+    result = certified(one(wall(-1.0, 3.0, 1.0, sign=size)))
+    np.testing.assert_allclose(result.slacks[0], 1.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("jac", [[1e308, -1e308, 0.0], [1e308, 0.0, 0.0]])
+def test_a_row_whose_value_is_not_finite_is_not_called_solved(jac: list[float]) -> None:
+    row = LinearRows("position", everywhere([jac]), everywhere([-1.0]), None, *[everywhere([1.0])] * 2)
+    horizon = one(row)
+    horizon.reference[..., :6:2] = 10.0
+    assert make_batch_solver("kernel").solve_batch(horizon).status[0, 0] == CODE[QpStatus.INACCURATE]
+
+
 @pytest.mark.parametrize("ratio", [1.0, 1e3])
 def test_the_dearer_of_two_walls_that_exclude_each_other_wins(ratio: float) -> None:
     result = certified(one(wall(-1.0, 10.0 * ratio, ratio), wall(-1.5, 10.0, 1.0, sign=-1.0), pull_m=0.25))
