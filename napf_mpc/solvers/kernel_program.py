@@ -195,10 +195,29 @@ def solve_rows(
 
 
 @compiled_bare
+def own_near(program: Program, maps: SignalMaps, table: RowTable, u: int, f: int) -> int:
+    """How many rows of a family are stiff beside their slack by what their own signals give at most."""
+    shelf, lonely, near = program.places.shelf[f], program.places.lonely[f], 0
+    for k in range(table.plane.shape[3]):
+        give = 0.0
+        for d in range(WIDTH):
+            coefficient = table.plane[u, d, f, k]
+            give += coefficient * coefficient * maps.give[program.places.axis[f, d], k]
+        alone = lonely & (table.shelves[u, W1, shelf, k] == 0.0)
+        finite = (table.plane[u, LOW, f, k] > -np.inf) | (table.plane[u, HIGH, f, k] < np.inf)
+        near += (table.shelves[u, W2, shelf, k] * give * WIDTH < SOFTEST) & finite & (not alone)
+    return near
+
+
+@compiled_bare
 def proximal(
-    program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room
+    program: Program, maps: SignalMaps, table: RowTable, u: int, work: WorkingSet, room: Room, strict: bool
 ) -> bool:
-    """Give slacks with next to no quadratic price one of their own; return whether there are any."""
+    """Give slacks with next to no quadratic price one of their own; return whether there are any.
+
+    Next to none is measured by what the row's own signals give, if strict, and else by the softest signal of
+    all, which nearly always does and leaves most programs without proximal steps.
+    """
     soft, stages, any_soft = table.price.shape[2], table.plane.shape[3], False
     for g in range(soft):
         work.w1[g], work.w2[g] = table.price[u, W1, g], table.price[u, W2, g]
@@ -209,17 +228,18 @@ def proximal(
         if shelf == table.shelves.shape[2]:
             continue
         for k in range(stages):
-            # An upper bound of the row's own Gram entry first, by Cauchy and Schwarz: it is cheap.
-            size, give = 0.0, 0.0
+            size = 0.0
             for d in range(WIDTH):
-                square = table.plane[u, d, f, k] * table.plane[u, d, f, k]
-                size, give = size + square, give + square * maps.give[program.places.axis[f, d], k]
+                size += table.plane[u, d, f, k] * table.plane[u, d, f, k]
             # A linear price, or a row that shares the slack, would drown in a slack so soft. A row alone
             # without one yields, that is all.
             alone = lonely & (table.shelves[u, W1, shelf, k] == 0.0)
-            most, least = (size * maps.softest, SOFTEST_ALONE) if alone else (give, SOFTEST)
+            least = SOFTEST_ALONE if alone else SOFTEST
             finite = (table.plane[u, LOW, f, k] > -np.inf) | (table.plane[u, HIGH, f, k] < np.inf)
-            near += (table.shelves[u, W2, shelf, k] * most * WIDTH < least) & finite
+            # An upper bound of the row's own Gram entry first: it is cheap.
+            near += (table.shelves[u, W2, shelf, k] * size * WIDTH * maps.softest < least) & finite
+        if strict:
+            near += own_near(program, maps, table, u, f)
         if near > 0:
             for k in range(stages):
                 room.give[shelf * stages + k] = -1.0
@@ -401,12 +421,12 @@ def solve_alone(
 ) -> int:  # fmt: skip
     """Solve a program in the only lane, with corrections and proximal steps; return how it ended."""
     work.counter[STEPS] = 0
-    status = LIMIT
-    for attempt in range(2):
+    status, strict = LIMIT, False
+    for attempt in range(3):
         # The corrections of the first attempt go with its multipliers.
         sweep(maps, lanes, False)
         read_signals(maps, lanes, 0, room.base)
-        softest = proximal(program, maps, table, u, work, room)
+        softest = proximal(program, maps, table, u, work, room, strict)
         reset(work, table.price.shape[2])
         guessed = warm and attempt == 0 and guess(program, maps, table, u, work, guess_z, guess_y, guess_at)
         if guessed:
@@ -422,8 +442,9 @@ def solve_alone(
             if certify(program, table, u, work, room, lanes, 0, at, z, y) <= EXACT:
                 return OPTIMAL
             status = ROUGH
-        if not guessed or status == LIMIT:
+        if strict or status == LIMIT or (status == INFEASIBLE and not guessed):
             return status
+        strict = not guessed
     return status
 
 
@@ -434,7 +455,7 @@ def begin(
 ) -> int:  # fmt: skip
     """Active set of a program by the kernel's signals; return how it ended, or that it wants more care."""
     work.counter[STEPS] = 0
-    if proximal(program, maps, table, u, work, room):
+    if proximal(program, maps, table, u, work, room, False):
         return ALONE
     read_signals(maps, lanes, u, room.base)
     reset(work, table.price.shape[2])
