@@ -119,6 +119,10 @@ class Values:
         at = (run, uav)
         return Values(self.p[at], self.q[at], self.a[at], self.lower[at], self.upper[at])
 
+    def copy(self) -> Values:
+        """The same numbers in arrays of their own."""
+        return Values(self.p.copy(), self.q.copy(), self.a.copy(), self.lower.copy(), self.upper.copy())
+
     def usable(self) -> NDArray[np.bool_]:
         """Whether each program (...) may be shown to a solver: finite numbers, bounds in order."""
         finite = np.isfinite(self.p).all(-1) & np.isfinite(self.q).all(-1) & np.isfinite(self.a).all(-1)

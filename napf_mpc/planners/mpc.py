@@ -42,10 +42,18 @@ from napf_mpc.planners.tally import COLUMNS, COUNTED, Tally
 from napf_mpc.planners.told import check_map, check_told
 from napf_mpc.problem import FormationMission, Problem
 from napf_mpc.problem import Planner as Settings
-from napf_mpc.qp import STATES, HorizonQp
+from napf_mpc.qp import STATES, HorizonQp, Layout
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals
-from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
+from napf_mpc.solvers.batch import (
+    STATUSES,
+    BatchResult,
+    BatchSolver,
+    WarmStart,
+    judged,
+    judges_itself,
+    make_batch_solver,
+)
 from napf_mpc.solvers.solver import SolverError
 from napf_mpc.vehicle.plant import plain
 from napf_mpc.vehicle.quadrotor import hover_input, mixer_inverse, rotor_limit
@@ -191,6 +199,7 @@ class QpPlanner:
         self._model = horizon_model(problem.vehicle, self._yaw, step, *weights(settings))
         solver = _solver_of(problem) if solver is None else solver
         self._solver = make_batch_solver(solver) if isinstance(solver, str) else solver
+        self._layout: Layout | None = None
         hover = mixer_inverse(problem.vehicle) @ hover_input(problem.vehicle)
         self._limits = AcceptanceLimits.of(
             self._model, mixer_inverse(problem.vehicle), -hover, rotor_limit(problem.vehicle) - hover
@@ -494,7 +503,12 @@ class QpPlanner:
     def _answer_to(self, programs: HorizonQp, warm: WarmStart | None, asked: Mask) -> BatchResult:
         """Answer of the solver; one that fails altogether has failed in all programs."""
         try:
-            return self._solver.solve_batch(programs, warm, asked)
+            answer = self._solver.solve_batch(programs, warm, asked)
+            if judges_itself(self._solver):
+                return answer
+            if self._layout is None or not self._layout.same_rows(programs):
+                self._layout = Layout.of(programs)
+            return judged(self._layout, programs, answer)
         except NapfError:
             raise  # rows that do not fit, a model that is not sound: to be mended, not flown around
         except Exception as error:

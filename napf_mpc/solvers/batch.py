@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Protocol
 
@@ -231,8 +231,7 @@ class PerUavSolver:
                     self._make, self._backends.get(at), layout.sparsity, values.of(*at), guess
                 )
                 status[at], iterations[at] = STATUSES.index(answer.status), answer.iterations
-                if answer.z.shape == (n,) and answer.y.shape == (m,):
-                    z[at], y[at] = answer.z, answer.y
+                z[at], y[at] = answer.z, answer.y
                 if answer.message:
                     messages[at] = answer.message
         primal, dual, complementarity = kkt_residuals(layout.sparsity, values, z, y)
@@ -250,6 +249,46 @@ class PerUavSolver:
             self._backends.clear()
         self._model = horizon.model
         return self._layout
+
+
+def judges_itself(solver: BatchSolver) -> bool:
+    """Whether the residuals of a solver's answers are this library's: it is a solver of ours."""
+    return type(solver).__module__.startswith("napf_mpc.")
+
+
+def judged(layout: Layout, horizon: HorizonQp, answer: object) -> BatchResult:
+    """An answer of any solver, with plans and residuals computed here from its points and multipliers.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of the horizon.
+    horizon : HorizonQp
+        What was to be solved.
+    answer : BatchResult
+        What the solver made of it.
+
+    Raises
+    ------
+    SolverError
+        If it is none, or does not fit the horizon.
+    """
+    if not isinstance(answer, BatchResult):
+        raise SolverError(f"solve_batch returned a {type(answer).__name__}, must return a BatchResult")
+    (runs, uavs, _), sizes = horizon.shape, layout.sparsity
+    want: dict[str, tuple[int, ...]] = {"status": (runs, uavs), "iterations": (runs, uavs)}
+    want |= {"z": (runs, uavs, sizes.variables), "y": (runs, uavs, sizes.constraints)}
+    for name, shape in want.items():
+        if getattr(answer, name).shape != shape:
+            raise SolverError(f"solve_batch: {name} has shape {getattr(answer, name).shape}, must be {shape}")
+    z, y = plain(answer.z), plain(answer.y)
+    with np.errstate(invalid="ignore", over="ignore"):
+        values = layout.values(horizon)
+    primal, dual, complementarity = kkt_residuals(layout.sparsity, values, z, y)
+    return replace(
+        answer, states=layout.states(z), inputs=layout.inputs(z), slacks=layout.block_slacks(z), z=z, y=y,
+        primal=primal, dual=dual, complementarity=complementarity,
+    )  # fmt: skip
 
 
 def checked_guess(warm: WarmStart | None, z: tuple[int, ...], y: tuple[int, ...]) -> WarmStart | None:

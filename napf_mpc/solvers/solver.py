@@ -267,7 +267,8 @@ def solve_safely(
         warm = (z, y) if np.isfinite(z).all() and np.isfinite(y).all() else None
     try:
         backend = make(sparsity) if backend is None else backend
-        answer = backend.solve(values, warm)
+        # Numbers of its own: what a back-end writes into them must not be what its answer is judged by.
+        answer = _fitting(backend.solve(values.copy(), warm), n, m)
     except Exception as error:
         return None, Answer.none(sparsity, QpStatus.FAILED, f"{type(error).__name__}: {error}")
     healthy = bool(np.isfinite(answer.z).all() and np.isfinite(answer.y).all())
@@ -276,3 +277,20 @@ def solve_safely(
     # After a failure a workspace holds iterates that say nothing of the next program.
     keep = healthy and answer.status in (QpStatus.SOLVED, QpStatus.INACCURATE, QpStatus.MAX_ITERATIONS)
     return (backend if keep else None), answer
+
+
+def _fitting(answer: object, n: int, m: int) -> Answer:
+    """The answer in our types.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is none, or does not fit a program of n variables and m constraints.
+    """
+    if not isinstance(answer, Answer):
+        raise TypeError(f"solve returned a {type(answer).__name__}, must return an Answer")
+    z, y = np.asarray(answer.z, dtype=float), np.asarray(answer.y, dtype=float)
+    for name, values, shape in (("z", z, (n,)), ("y", y, (m,))):
+        if values.shape != shape:
+            raise ValueError(f"{name} has shape {values.shape}, must be {shape}")
+    return Answer(QpStatus(answer.status), z, y, int(answer.iterations), answer.message)

@@ -27,6 +27,7 @@ from napf_mpc.problem_file import load_problem
 from napf_mpc.qp import HorizonQp
 from napf_mpc.solvers.batch import STATUSES, BatchResult, BatchSolver, WarmStart, make_batch_solver
 from napf_mpc.solvers.kernel import KernelSolver
+from napf_mpc.solvers.solver import SolverError
 from napf_mpc.vehicle.quadrotor import mixer_inverse, rotor_limit
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.shapes import Box, Sphere
@@ -733,6 +734,55 @@ def test_whatever_the_solver_returns_commands_are_sound_and_every_fall_back_is_c
     assert causes >= {"late", "status", "not_finite"}
     assert not missions.score.obstacle_contact.any()
     assert missions.score.finished.all()
+
+
+class Lies:
+    """Yesterday's plan, or none that is the program's, with residuals that are said to be zero."""
+
+    def __init__(self, lie: Callable[[BatchResult], object]) -> None:
+        self.solver, self.lie = make_batch_solver("kernel"), lie
+
+    def reset(self) -> None:
+        self.solver.reset()
+
+    def solve_batch(
+        self, horizon: HorizonQp, warm: WarmStart | None = None, active: np.ndarray | None = None
+    ) -> Any:
+        return self.lie(self.solver.solve_batch(horizon, warm, active))
+
+
+def stepped(lie: Callable[[BatchResult], object]) -> Command:
+    planner = QpPlanner(problem(), solver=Lies(lie))
+    planner.reset(ObstacleSet.empty(), 1)
+    return planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
+
+
+def test_residuals_of_a_solver_of_ones_own_are_not_believed_either() -> None:
+    flown = stepped(lambda answer: answer)
+    assert flown.plan is not None
+    assert not flown.holding.any()
+    assert stepped(lambda answer: replace(answer, z=0.5 * answer.z)).holding.all()
+    assert stepped(lambda answer: replace(answer, y=0.5 * answer.y + 1.0)).holding.all()
+    # What flies is the point that was judged.
+    beside = stepped(lambda answer: replace(answer, inputs=answer.inputs + 0.1, states=2.0 * answer.states))
+    assert beside.plan is not None
+    np.testing.assert_array_equal(beside.plan.inputs, flown.plan.inputs)
+    np.testing.assert_array_equal(beside.plan.states, flown.plan.states)
+
+
+@pytest.mark.parametrize(
+    ("lie", "words"),
+    [
+        (lambda answer: None, "returned a NoneType, must return a BatchResult"),
+        (lambda answer: replace(answer, y=answer.y[..., 1:]), "y has shape"),
+        (lambda answer: replace(answer, status=answer.status[:, :1]), "status has shape"),
+    ],
+)
+def test_an_answer_that_does_not_fit_is_an_error_and_not_a_fall_back(
+    lie: Callable[[BatchResult], object], words: str
+) -> None:
+    with pytest.raises(SolverError, match=words):
+        stepped(lie)
 
 
 def test_late_answers_are_only_known_where_there_is_a_clock() -> None:

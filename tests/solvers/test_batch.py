@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -499,8 +500,8 @@ STUBS = [
     ("nan multipliers", lambda answer: replace(answer, y=answer.y * np.nan), Refusal.STATUS),
     ("zeros", claims(0.0, 0.0), Refusal.PRIMAL),
     ("exception", raises, Refusal.STATUS),
-    ("wrong length", lambda answer: replace(answer, z=answer.z[:-1]), Refusal.PRIMAL),
-    ("empty", lambda answer: replace(answer, z=np.zeros(0), y=np.zeros(0)), Refusal.NOT_FINITE),
+    ("wrong length", lambda answer: replace(answer, z=answer.z[:-1]), Refusal.STATUS),
+    ("empty", lambda answer: replace(answer, z=np.zeros(0), y=np.zeros(0)), Refusal.STATUS),
     ("input outside", outside, Refusal.INPUT),
     ("no multipliers", lambda answer: replace(answer, y=0.0 * answer.y), Refusal.DUAL),
     ("other multipliers", lambda answer: replace(answer, y=-answer.y), Refusal.DUAL),
@@ -514,8 +515,7 @@ def test_garbage_is_refused(name: str, lie: Callable[[Answer], Answer], why: Ref
     solver = PerUavSolver(lambda sparsity: Stub(sparsity, lie))
     result = solver.solve_batch(flight(2, 2, 4, wall_m=1.5))
     assert not accepted(result, LIMITS).any()
-    if why is not Refusal.PRIMAL or name == "zeros":
-        np.testing.assert_array_equal(refusals(result, LIMITS), why)
+    np.testing.assert_array_equal(refusals(result, LIMITS), why)
 
 
 class Stale:
@@ -617,6 +617,58 @@ def test_own_solvers_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
         make_batch_solver("nothing")
     with pytest.raises(SolverError, match="test_structured"):
         make_batch_solver("test_structured", speed=3)
+
+
+class Odd:
+    """A back-end that solves, and does something to the numbers or the answer."""
+
+    def __init__(self, sparsity: Sparsity, odd: Callable[[Values, Answer], Any]) -> None:
+        self.backend, self.odd = backend_maker("osqp")(sparsity), odd
+
+    def solve(self, values: Values, warm: Warm | None) -> Any:
+        return self.odd(values, self.backend.solve(values, warm))
+
+
+def odd(change: Callable[[Values, Answer], Any]) -> BatchResult:
+    return PerUavSolver(lambda sparsity: Odd(sparsity, change)).solve_batch(flight(1, 2))
+
+
+def test_an_answer_is_judged_by_the_numbers_given_and_not_by_what_became_of_them() -> None:
+    def halve(values: Values, answer: Answer) -> Answer:
+        values.q *= 0.5
+        values.upper[:] = np.inf
+        return replace(answer, z=0.5 * answer.z)
+
+    good, halved = odd(lambda values, answer: answer), odd(halve)
+    assert accepted(good, LIMITS).all()
+    assert not accepted(halved, LIMITS).any()
+    assert halved.dual.min() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda values, answer: None, "returned a NoneType, must return an Answer"),
+        (lambda values, answer: (answer.status, answer.z, answer.y), "returned a tuple"),
+        (lambda values, answer: replace(answer, z=answer.z[:, None]), r"z has shape \(\d+, 1\), must be"),
+        (lambda values, answer: replace(answer, y=None), "y has shape"),
+        (lambda values, answer: replace(answer, status="optimal"), "'optimal' is not a valid QpStatus"),
+    ],
+)
+def test_what_is_no_answer_fails_in_words(change: Callable[[Values, Answer], Any], words: str) -> None:
+    result = odd(change)
+    assert (result.status == FAILED).all()
+    for message in result.messages.values():
+        with pytest.raises(AssertionError, match=words):
+            raise AssertionError(message)
+
+
+def test_lists_and_words_for_a_status_will_do() -> None:
+    result = odd(
+        lambda values, answer: replace(answer, z=answer.z.tolist(), y=answer.y.tolist(), status="solved")
+    )
+    np.testing.assert_array_equal(result.z, odd(lambda values, answer: answer).z)
+    assert accepted(result, LIMITS).all()
 
 
 def test_program_of_a_horizon_can_be_held_and_given_to_another_solver() -> None:
