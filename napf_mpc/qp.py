@@ -50,7 +50,11 @@ STATES, INPUTS = 12, 4
 
 @dataclass(frozen=True, eq=False)
 class HorizonModel:
-    """Linear model about hover and weights on a stage grid, shared by all runs and UAVs."""
+    """Linear model about hover and weights on a stage grid, shared by all runs and UAVs.
+
+    Solvers keep what they compute of a model for as long as they are given this very object: for other
+    numbers make another, and do not write into its arrays.
+    """
 
     step_s: Array
     """(N,) length of each stage [s]."""

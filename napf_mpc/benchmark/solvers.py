@@ -246,10 +246,12 @@ def _times(rows: Sequence[Row]) -> list[float]:
 def gain(rival: Sequence[float], mine: Sequence[float]) -> tuple[float, float, float]:
     """Median of a rival's times over mine, call by call, with the 95 % interval of its order statistics.
 
-    Without a rival there is none.
+    Without a rival there is none; of fewer than six calls no interval holds the median with 95 %.
     """
     if not rival:
         return np.nan, np.nan, np.nan
     ratio = np.sort(np.array(rival) / np.array(mine))
-    rank = max(int(binom.ppf(0.025, len(ratio), 0.5)), 1)
+    rank = int(binom.ppf(0.025, len(ratio), 0.5))
+    if rank < 1:
+        return float(np.median(ratio)), np.nan, np.nan
     return float(np.median(ratio)), float(ratio[rank - 1]), float(ratio[-rank])

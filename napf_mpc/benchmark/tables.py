@@ -111,7 +111,7 @@ def _ratio(gain: tuple[float, float, float], wide: bool) -> str:
     median, low, high = gain
     if math.isnan(median):
         return "-"
-    return f"{median:.3g}" + (f" [{low:.3g}, {high:.3g}]" if wide else "")
+    return f"{median:.3g}" + (f" [{low:.3g}, {high:.3g}]" if wide and not math.isnan(low) else "")
 
 
 def nonlinear_tables(summaries: Sequence[NonlinearSummary], flights: str, wide: bool) -> list[Rows]:
