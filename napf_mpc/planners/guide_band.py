@@ -170,6 +170,7 @@ def take_solids(
     i: int,
     step_m: float,
     weight: float,
+    level: bool,
     draft: Array,
     profile: Array,
     band: Band,
@@ -179,7 +180,8 @@ def take_solids(
 
     With a positive weight, linearised shortfalls are added to the profile's band system too. Where the
     distance grows along the path only, as before a wall, its gradient does not tell which way to give: there
-    the profile is drawn to its draft.
+    the profile is drawn to its draft. Where drafts are level, a sphere pushes nobody up or down: along its
+    surface it would push a way past its side under itself, where no way has been looked for.
     """
     missing[:] = 0.0
     own, right = band.own, band.right
@@ -231,6 +233,8 @@ def take_solids(
             missing[s] = max(missing[s], short)
             if weight <= 0.0 or short <= 0.0:
                 continue
+            if level and ball > 0.0:
+                g1 = 0.0
             if g0 * g0 + g1 * g1 < LEAST_ACROSS**2:
                 add_row(own, right, s, weight * step_m, 1.0, 0.0, draft[s, 0])
                 add_row(own, right, s, weight * step_m, 0.0, 1.0, draft[s, 1])

@@ -304,23 +304,19 @@ def vertical_room(
     count: int,
     lane_up: float,
     reach: float,
-    most: float,
-    least: float,
-) -> tuple[bool, bool, bool]:
-    """Whether it makes sense to go up, down past spheres, and down under what hangs in the air.
+    most_up: float,
+) -> tuple[bool, bool, float]:
+    """Whether it makes sense to go up past what was found, whether all are spheres, and how far down to go.
 
-    Up: something has a top that can be passed within ``most`` metres. Down past spheres: there is nothing
-    else, for what stands on the ground has ground under it. Under: something else has a bottom that can be
-    passed within ``least`` metres below the lane, where it is known that no ground is.
+    Up: something has a top that can be passed within ``most_up`` metres. Down is to where the first of them
+    can be passed beneath [m], endless if nothing was found.
     """
     upwards = False
     spheres = True
-    under = False
+    down = np.inf
     for entry in range(count):
         i = found[entry]
-        if solids.kind[i] != SPHERE:
-            spheres = False
-            under = under or lane_up - (boxes.low[i, 2] - reach) <= least
-        if boxes.high[i, 2] + reach - lane_up <= most:
-            upwards = True
-    return upwards, spheres and upwards, under
+        spheres = spheres and solids.kind[i] == SPHERE
+        upwards = upwards or boxes.high[i, 2] + reach - lane_up <= most_up
+        down = min(down, lane_up + reach - boxes.low[i, 2])
+    return upwards, spheres, down

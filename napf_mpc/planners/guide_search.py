@@ -266,31 +266,33 @@ def plan_run(
     span = lattice.half * lattice.cell_m
     ahead = (lattice.stations - 1) * lattice.step_m
     found, count, reach = scratch.found, scratch.solid_count, scratch.reach
-    upwards = under = False
+    upwards = False
     spheres = True
     farthest = 0.0
+    down = np.inf
     for i in range(uavs):
         reach[i] = largest_reach(covariance[i], search.margins.k, need)
         farthest = max(farthest, reach[i])
-    to_ground = int(min(max(search.ground_room_m - farthest, 0.0), ENDLESS_M) / lattice.layer_m)
-    beneath = min(lattice.under, to_ground)
-    for i in range(uavs):
         count[i] = gather(
             boxes, first, stop, along[i] - 1.0, along[i] + ahead, lanes[i, 0] - span, lanes[i, 0] + span,
             reach[i], found[i],
         )  # fmt: skip
-        up, down, below_it = vertical_room(
-            solids, boxes, found[i], count[i], lanes[i, 1], reach[i], lattice.layers * lattice.layer_m,
-            beneath * lattice.layer_m,
-        )  # fmt: skip
+        up, alike, depth = vertical_room(
+            solids, boxes, found[i], count[i], lanes[i, 1], reach[i], lattice.layers * lattice.layer_m
+        )
         upwards = upwards or up
-        spheres = spheres and (down or count[i] == 0)
-        under = under or (below_it and beneath > 0)
+        spheres = spheres and alike
+        down = min(down, depth)
+    to_ground = int(min(max(search.ground_room_m - farthest, 0.0), ENDLESS_M) / lattice.layer_m)
+    # Past spheres down is as good as up; past what stands on the ground there is no down, ...
     below = min(lattice.sphere_layers // 2, to_ground)
-    if spheres and upwards and below > 0:
+    if spheres and below > 0 and (upwards or down <= below * lattice.layer_m):
         layers = 1 + 2 * below
     else:
-        below = beneath if under else 0
+        # ... unless something hangs in the air, so near that it is known that no ground is below.
+        below = min(lattice.under, to_ground)
+        if down > below * lattice.layer_m:
+            below = 0
         layers = 1 + below + (lattice.layers if upwards else 0)
     mean = np.empty((fine, 2))
     sight = Sight(
@@ -394,7 +396,9 @@ def plan_run(
                 if sight.has_sky:
                     add_sky(sight.sky[i], lattice, below, layers, step, trial[i], band.own, band.right)
                 if is_short[i]:
-                    take_solids(sight, i, step, PUSH, drafts[i], trial[i], band, trial_missing[i])
+                    take_solids(
+                        sight, i, step, PUSH, layers == 1, drafts[i], trial[i], band, trial_missing[i]
+                    )
                 for j in range(uavs):
                     if j != i and abs(along[i] - along[j]) < separation[i, j]:
                         add_neighbour(
@@ -408,7 +412,7 @@ def plan_run(
                         change = band.right[s, a] - trial[i, s, a]
                         trial[i, s, a] += min(max(change, -search.pass_m), search.pass_m)
         for i in range(uavs):
-            take_solids(sight, i, step, 0.0, drafts[i], trial[i], band, trial_missing[i])
+            take_solids(sight, i, step, 0.0, layers == 1, drafts[i], trial[i], band, trial_missing[i])
         mean_profile(trial, draft_mean)
         price = band_price(trial, draft_mean, last, trial_missing, step, prices)
         if sight.has_sky:

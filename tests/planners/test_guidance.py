@@ -409,6 +409,28 @@ def test_spheres_are_passed_above_where_the_ground_leaves_no_room_below(start_m:
     assert clearance(made, [place + origin for place in places]) > K_SIGMA - SETTINGS.squeeze_m
 
 
+@pytest.mark.parametrize(
+    ("radius_m", "over_m"), [(15.0, 6.0), (18.0, 7.2), (18.0, 9.0), (22.0, 11.0), (22.0, -11.0)]
+)
+def test_a_sphere_too_large_to_dive_under_is_passed_beside(radius_m: float, over_m: float) -> None:
+    """Its normal points down, but a way down there has not been looked for: who slides under it is stuck."""
+    made = guidance([Sphere((60.0, 1.0, over_m), radius_m)])
+    places, guides = follow(made)
+    assert places[-1][:, 0].min() >= 110.0
+    assert Passage.NO_PASSAGE not in reasons(guides)
+    assert clearance(made, places) > K_SIGMA - SETTINGS.squeeze_m
+
+
+def test_a_sphere_too_large_to_climb_over_is_passed_under_where_that_is_near() -> None:
+    made = guidance([Sphere((60.0, 0.0, 16.0), 18.0)])  # 2 m of it under the lanes
+    places, guides = follow(made)
+    assert places[-1][:, 0].min() >= 110.0
+    offsets = np.concatenate([guide.offset[0].reshape(-1, 2) for guide in guides])
+    assert np.abs(offsets[:, 0]).max() < 3.0
+    assert offsets[:, 1].min() == pytest.approx(-2.0 - RADIUS - K_SIGMA - SETTINGS.spare_m, abs=1.0)
+    assert clearance(made, places) > K_SIGMA - SETTINGS.squeeze_m
+
+
 def fast(speed_mps: float) -> Problem:
     """Four UAVs in a line across, 6 m apart, and a gap of 10 m in a wall before them."""
     walls = [
