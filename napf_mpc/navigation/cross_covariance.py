@@ -69,13 +69,16 @@ def advance_pairs(
 
 
 @compiled
-def factorise(common: Array, factor: Array) -> None:
+def factorise(common: Array, since: Array, factor: Array) -> None:
     """Write factors L_i of the common position covariances: Sigma_ij = L_i L_j^T for i != j, exactly.
 
     Parameters
     ----------
     common : array, shape (run, 3, uav, uav, 4, 4)
-        As :func:`advance_pairs` keeps it.
+        As :func:`advance_pairs` keeps it, at the last epoch of fixes.
+    since : array, shape (4, 4)
+        Transition of each axis from that epoch to now. Variances may fall meanwhile, and what is common of
+        them must fall with them.
     factor : array, shape (run, uav, 3, 3 uav)
         Out; zeros come in. Axis a uses the columns from ``a uav`` on, as Cholesky's triangle.
     """
@@ -83,16 +86,17 @@ def factorise(common: Array, factor: Array) -> None:
     for r in range(common.shape[0]):
         for a in range(3):
             for j in range(uavs):
-                left = common[r, a, j, j, 0, 0]
+                whole = _position_now(common[r, a, j, j], since)
+                left = whole
                 for n in range(j):
                     left -= factor[r, j, a, a * uavs + n] ** 2
                 # A UAV that adds nothing of its own to the others (all begin alike) leaves a rounding error.
-                if not left > 1e-12 * common[r, a, j, j, 0, 0]:
+                if not left > 1e-12 * whole:
                     continue
                 pivot = np.sqrt(left)
                 factor[r, j, a, a * uavs + j] = pivot
                 for i in range(j + 1, uavs):
-                    rest = common[r, a, j, i, 0, 0]
+                    rest = _position_now(common[r, a, j, i], since)
                     for n in range(j):
                         rest -= factor[r, i, a, a * uavs + n] * factor[r, j, a, a * uavs + n]
                     factor[r, i, a, a * uavs + j] = rest / pivot
@@ -151,6 +155,16 @@ def report_axes(cross: Array, since: Array, covariance: Array) -> None:
                                 value += since[p, k] * cross[r, i, n, k, m] * since[q, m]
                         covariance[r, i, 3 * p + a, 3 * q + b] = value
                         covariance[r, i, 3 * q + b, 3 * p + a] = value
+
+
+@compiled_bare
+def _position_now(m: Array, since: Array) -> float:
+    """Entry of two positions in F m F^T."""
+    value = 0.0
+    for row in range(4):
+        for column in range(4):
+            value += since[0, row] * m[row, column] * since[0, column]
+    return value
 
 
 @compiled_bare

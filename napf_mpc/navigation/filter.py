@@ -103,7 +103,7 @@ class KalmanFilter:
         for _ in range(model.ticks_per_epoch):
             self._since.append(tick @ self._since[-1])
         self._age = 0
-        self._common_factor = np.zeros((runs, uavs, 3, 3 * uavs if shared else 1))
+        self._common_rank = 3 * uavs if shared else 1
 
     @property
     def refused_fixes(self) -> NDArray[np.int64]:
@@ -317,8 +317,6 @@ class KalmanFilter:
             cross_covariance.advance_pairs(
                 self._common, self._carried, self._response, self._model.common_share, begun, active
             )
-            self._common_factor = np.zeros_like(self._common_factor)
-            cross_covariance.factorise(self._common, self._common_factor)
         if len(self._cross):
             correlation = np.empty(sigma.shape)
             for n, (a, b) in enumerate(cross_covariance.AXIS_PAIRS):
@@ -341,7 +339,7 @@ class KalmanFilter:
         -------
         NavSolution
             Available with a fix in use, and without one while every axis' sigma is at most
-            ``filter_coast_sigma_m``. The common factor is that of the last epoch of fixes.
+            ``filter_coast_sigma_m``.
         """
         runs, uavs = self._verdict.shape
         position, velocity = np.empty((runs, uavs, 3)), np.empty((runs, uavs, 3))
@@ -349,6 +347,9 @@ class KalmanFilter:
         kalman.report(self._mean, self._packed, position, velocity, covariance, widest)
         if len(self._cross):
             cross_covariance.report_axes(self._cross, self._since[self._age], covariance)
+        common_factor = np.zeros((runs, uavs, 3, self._common_rank))
+        if len(self._common):
+            cross_covariance.factorise(self._common, self._since[self._age], common_factor)
         return NavSolution(
             time_s=time_s,
             available=(self._record.used | (widest <= self._model.coast_sigma_m**2)) & ~self._doubted,
@@ -357,7 +358,7 @@ class KalmanFilter:
             attitude=attitude,
             body_rates=body_rates,
             covariance=covariance,
-            common_factor=self._common_factor,
+            common_factor=common_factor,
             disputed=None if self._monitor is None else self._doubted,
             filtered=True,
             forecast=CovarianceForecast(

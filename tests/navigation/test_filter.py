@@ -536,6 +536,18 @@ def test_what_two_uavs_share_is_what_their_errors_share() -> None:
     assert np.mean(naive[len(naive) // 2 :]) > 2.0
 
 
+def test_between_fixes_what_is_shared_falls_with_the_whole() -> None:
+    """One fix a second: in between the variance may fall, and a share beyond it would not be trusted."""
+    config = paper(common_mode_share=1.0, sigma_min_m=0.02, sigma_max_m=0.1, sigma_period_s=5.0, rate_hz=1.0)
+    flight = flown(config, 20.0, runs=3, every=5)
+    fell = 0
+    for tick, (before, nav) in enumerate(pairwise(flight.solutions), 1):
+        falls = nav.position_covariance < before.position_covariance * (1.0 - 1e-3)
+        fell += np.count_nonzero(falls) if tick % 10 else 0  # a fix at every tenth
+        assert nav.trusted().all(), nav.time_s
+    assert fell > 100
+
+
 def test_uavs_with_one_sigma_share_all_that_is_common() -> None:
     """Same sigma at all times: the same gains, so the shares of error and of covariance are one."""
     for share in (0.3, 1.0):
