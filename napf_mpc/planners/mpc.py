@@ -40,9 +40,9 @@ from napf_mpc.planners.planner import Command
 from napf_mpc.planners.references import SlotReference
 from napf_mpc.planners.tally import COLUMNS, COUNTED, Tally
 from napf_mpc.planners.told import check_map, check_told
-from napf_mpc.problem import FormationMission, Problem
+from napf_mpc.problem import FormationMission, Problem, Vehicle
 from napf_mpc.problem import Planner as Settings
-from napf_mpc.qp import STATES, HorizonQp, Layout
+from napf_mpc.qp import INPUTS, STATES, HorizonQp, Layout
 from napf_mpc.safety_distance import Inflation
 from napf_mpc.solvers.acceptance import AcceptanceLimits, Refusal, refusals
 from napf_mpc.solvers.batch import (
@@ -76,6 +76,8 @@ REPULSION_PART = 0.5
 LEAVING_MPS, LEAVING_RAW_MPS = 2.0, 0.3
 """``planner.leaving_mps`` behind a filter, and on raw measurements. These wander in and out of margins by
 metres: who leaves faster than errors fade flies after them."""
+THRUST_WEIGHT, TORQUE_WEIGHT = 60.0, 600.0
+"""``planner.thrust_weight`` and ``planner.torque_weight`` of the paper's vehicle, in their units."""
 SPEED_PRICE = (1000.0, 1000.0)
 """Prices of a speed slack: above what the margins can gain by it, so that no margin buys a dash."""
 _CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
@@ -129,15 +131,25 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     return [contact, influence, *others, speed, TiltLimit(), InputBox()]
 
 
-def weights(settings: Settings) -> tuple[Array, Array]:
+def weights(settings: Settings, vehicle: Vehicle) -> tuple[Array, Array]:
     """Diagonals (12,) of Q and (4,) of R per second, in the order of Eq. 1 and 2.
 
-    One weight for both horizontal axes, so that the Hessian depends neither on the heading nor on yaw.
+    One weight for both horizontal axes, so that the Hessian depends neither on the heading nor on yaw. What
+    inputs cost goes by accelerations unless it is given: a newton is less to who is heavier.
     """
+    usual = Vehicle()
+    inputs = np.empty(INPUTS)
+    inputs[0], inputs[1:] = THRUST_WEIGHT, TORQUE_WEIGHT
+    inputs[0] *= (usual.mass_kg / vehicle.mass_kg) ** 2
+    inputs[1:] *= (np.array(usual.inertia_kgm2) / np.array(vehicle.inertia_kgm2)) ** 2
+    if settings.thrust_weight is not None:
+        inputs[0] = settings.thrust_weight
+    if settings.torque_weight is not None:
+        inputs[1:] = settings.torque_weight
     state = np.empty(STATES)
     state[POSITION], state[VELOCITY] = settings.position_weight, settings.velocity_weight
     state[6:12:2], state[7:12:2] = settings.attitude_weight, 0.2 * settings.attitude_weight
-    return state, np.array([settings.thrust_weight, *[settings.torque_weight] * 3])
+    return state, inputs
 
 
 class QpPlanner:
@@ -196,7 +208,7 @@ class QpPlanner:
         step = stage_grid(self._period_s, settings.horizon, settings.look_ahead_s)
         self._grid = np.append(0.0, step)  # now, and the ends of the stages
         self._yaw = self._frame.heading_rad
-        self._model = horizon_model(problem.vehicle, self._yaw, step, *weights(settings))
+        self._model = horizon_model(problem.vehicle, self._yaw, step, *weights(settings, problem.vehicle))
         solver = _solver_of(problem) if solver is None else solver
         self._solver = make_batch_solver(solver) if isinstance(solver, str) else solver
         self._layout: Layout | None = None

@@ -50,10 +50,10 @@ class Planner(Section):
     """QP planner: weight of the velocity error [s/m^2]."""
     attitude_weight: float = Field(1.0, ge=0.0, le=1e6)
     """QP planner: weight of roll, pitch and yaw error [1/(rad^2 s)]; a fifth of it on body rates."""
-    thrust_weight: float = Field(60.0, ge=1e-9, le=1e6)
-    """QP planner: weight of the thrust about hover [1/(N^2 s)]."""
-    torque_weight: float = Field(600.0, ge=1e-9, le=1e6)
-    """QP planner: weight of the torques [1/(N^2 m^2 s)]."""
+    thrust_weight: Annotated[float, Field(ge=1e-9, le=1e6)] | None = None
+    """QP planner: weight of the thrust about hover [1/(N^2 s)]; by default 60 for the paper's vehicle, and for others what prices the same acceleration alike."""  # noqa: E501
+    torque_weight: Annotated[float, Field(ge=1e-9, le=1e6)] | None = None
+    """QP planner: weight of the torques [1/(N^2 m^2 s)]; by default 600 for the paper's vehicle, and for others what prices the same angular acceleration alike."""  # noqa: E501
     contact_price: float = Field(300.0, ge=0.0, le=1e9)
     """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]."""
     margin: Literal["half_space", "passage"] = "half_space"

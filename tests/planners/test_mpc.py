@@ -103,6 +103,27 @@ def test_on_the_slots_in_free_air_the_plan_is_to_fly_straight_on_with_hover_thru
     assert not command.holding.any()
 
 
+@pytest.mark.parametrize("times", [0.5, 8.0])
+def test_a_heavier_vehicle_with_the_thrust_for_it_plans_the_same_way(times: float) -> None:
+    """Mass and inertia in one ratio: the same accelerations cost the same, but for weights that are given."""
+
+    def planned(times: float, **weights: float) -> np.ndarray:
+        inertia = tuple(times * moment for moment in (8.1e-3, 8.1e-3, 14.2e-3))
+        vehicle = {"radius_m": 0.3, "mass_kg": times, "inertia_kgm2": inertia, "arm_m": 0.24 * times}
+        planner = QpPlanner(problem(vehicle=vehicle, planner=weights))
+        planner.reset(ObstacleSet.from_shapes([Sphere((20.0, 3.0, 0.0), 2.0)]), 1)
+        states = on_slots(planner)
+        states[..., :3] += np.array([0.0, 1.0, -1.0])
+        plan = planner.step(nav(states), 0.0).plan
+        assert plan is not None
+        return plan.states
+
+    usual = planned(1.0)
+    np.testing.assert_allclose(planned(times), usual, atol=1e-5)
+    given = planned(times, thrust_weight=60.0, torque_weight=600.0)
+    assert np.abs(given - usual).max() > 0.05
+
+
 def test_a_plan_keeps_k_sigma_and_its_radius_clear_of_a_wall_beside_the_lane() -> None:
     asked = problem(planner={"kind": "qp", "influence_scale": 1e-6, "guidance": "none", "cohesion": 0.0})
     planner = QpPlanner(asked)
