@@ -137,6 +137,7 @@ class Guidance:
         self._sigma_map: SigmaMap | None = None
         self._sky: SkyField = NO_SKY
         self._busy = np.zeros(runs, dtype=bool)
+        self._far = np.zeros(runs, dtype=bool)
         self._planned_at = np.zeros((runs, uavs))
         self._position = np.repeat(self._path.to_world(self._slots)[None], runs, axis=0)
         self._covariance = np.tile(np.eye(3), (runs, uavs, 1, 1))
@@ -263,6 +264,7 @@ class Guidance:
             self._kept,
             self._paid,
             self._busy,
+            self._far,
         )
         self._planned_at = along
         self._taut = None

@@ -35,6 +35,9 @@ Array = NDArray[np.float64]
 
 LEAST_ACROSS = 0.3
 """Part of a unit gradient that must lie across the path for a push along it."""
+EDGE_PUSH = 10.0
+"""How much firmer edges push than what is round: a way round a corner is steep on both sides of it, and what
+steepness costs far out would outbid the margin."""
 
 
 class Band(NamedTuple):
@@ -165,6 +168,26 @@ def add_row(own: Array, right: Array, s: int, weight: float, g0: float, g1: floa
 
 
 @compiled_bare
+def way_across(short: float, distance: float, across: float) -> float:
+    """How far to go across the path to make up for a shortfall beside an edge [m].
+
+    The nearest point of a corner stays where it is: what is missing is made up for across the path alone, and
+    that is more than the shortfall, where the corner is mostly ahead or behind.
+
+    Parameters
+    ----------
+    short, distance : float
+        Shortfall and distance [m].
+    across : float
+        Part of the unit gradient across the path, > 0.
+    """
+    if distance <= 0.0:
+        return short / across
+    along = (1.0 - across * across) * distance * distance
+    return math.sqrt((short + distance) ** 2 - along) - across * distance
+
+
+@compiled_bare
 def take_solids(
     sight: Sight,
     i: int,
@@ -215,7 +238,9 @@ def take_solids(
             z = ball * (up - near[i, entry, UP])
             if ball >= 0.0 and x * x + y * y + z * z > near[i, entry, OUTER2]:
                 continue
-            if is_round(near, i, entry, up):
+            even = is_round(near, i, entry, up)
+            distance = 0.0
+            if even:
                 short, g0, g1 = round_shortfall(
                     x,
                     y,
@@ -227,20 +252,25 @@ def take_solids(
                     need,
                 )
             else:
-                short, g0, g1 = shortfall(
+                short, g0, g1, distance = shortfall(
                     solids, found[i, entry], frame, along, left, up, covariance, k, need
-                )  # fmt: skip
+                )
             missing[s] = max(missing[s], short)
             if weight <= 0.0 or short <= 0.0:
                 continue
             if level and ball > 0.0:
                 g1 = 0.0
-            if g0 * g0 + g1 * g1 < LEAST_ACROSS**2:
+            across = math.sqrt(g0 * g0 + g1 * g1)
+            if across < LEAST_ACROSS:
                 add_row(own, right, s, weight * step_m, 1.0, 0.0, draft[s, 0])
                 add_row(own, right, s, weight * step_m, 0.0, 1.0, draft[s, 1])
-            else:
-                wanted = short + g0 * profile[s, 0] + g1 * profile[s, 1]
-                add_row(own, right, s, weight * step_m, g0, g1, wanted)
+                continue
+            firm = weight
+            if not even:
+                g0, g1, short = g0 / across, g1 / across, way_across(short, distance, across)
+                firm = EDGE_PUSH * weight
+            wanted = short + g0 * profile[s, 0] + g1 * profile[s, 1]
+            add_row(own, right, s, firm * step_m, g0, g1, wanted)
 
 
 @compiled_bare

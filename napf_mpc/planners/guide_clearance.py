@@ -201,8 +201,8 @@ def shortfall(
     covariance: Array,
     k: float,
     need_m: float,
-) -> tuple[float, float, float]:
-    """Missing clearance [m] to solid i at a place in path coordinates, and the distance's gradient there.
+) -> tuple[float, float, float, float]:
+    """Missing clearance to solid i at a place in path coordinates, the distance's gradient there, and itself.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def shortfall(
     Returns
     -------
     tuple of float
-        Shortfall [m], and the gradient's parts to the left and up.
+        Shortfall [m], the gradient's parts to the left and up, and the distance [m].
     """
     ax = frame.axes
     px, py, pz = world_place(frame, along, left, up)
@@ -235,6 +235,7 @@ def shortfall(
         missing,
         gx * ax[1, 0] + gy * ax[1, 1] + gz * ax[1, 2],
         gx * ax[2, 0] + gy * ax[2, 1] + gz * ax[2, 2],
+        d,
     )
 
 

@@ -57,12 +57,14 @@ class Search(NamedTuple):
     """Settings of the search."""
 
     lattice: Lattice
+    far: Lattice  # the same, farther to the sides
     wide: Lattice  # coarser and farther to the sides, for large margins
     wide_m: float  # radius and margin from which that is used
     prices: Prices
     wide_prices: Prices  # of the coarser lattice
     margins: PassageMargins  # sigmas to keep
     radius_m: float
+    large_m: float  # width of what may take the wide lattice to get past [m]
     ground_room_m: float  # of the lowest lane above the ground, infinite if none is known [m]
     passes: int
     pass_m: float  # largest step of a pass [m]
@@ -155,7 +157,7 @@ class Scratch(NamedTuple):
 
 def make_scratch(uavs: int, fine: int, most: int, search: Search) -> Scratch:
     """Scratch for runs of so many UAVs that see so many solids each, with room for both lattices."""
-    first = search.lattice
+    first = search.far
     wide = search.wide
     stations = max(first.stations, wide.stations)
     cells = 2 * max(first.half, wide.half) + 1
@@ -192,7 +194,7 @@ def make_scratch(uavs: int, fine: int, most: int, search: Search) -> Scratch:
 
 
 @compiled
-def plan_run(
+def _plan_on(
     solids: Solids,
     boxes: SolidBoxes,
     first: int,
@@ -208,13 +210,15 @@ def plan_run(
     last: Array,
     stuck: bool,
     search: Search,
+    lattice: Lattice,
+    prices: Prices,
     profiles: Array,
     missing: Array,
     kept: Array,
     paid: Array,
     scratch: Scratch,
 ) -> bool:
-    """Plan the profiles of one run's UAVs.
+    """Plan the profiles of one run's UAVs on one lattice.
 
     Parameters
     ----------
@@ -236,8 +240,8 @@ def plan_run(
         Last profiles, from where the UAVs are now [m].
     stuck : bool
         Whether the formation stands before something: then UAVs may also go aside on the spot.
-    search : Search
-        Settings.
+    search, lattice, prices : Search, Lattice and Prices
+        Settings, and those of the lattice.
     profiles, missing : array, shape (uav, station, 2), (uav, station)
         Written: profiles, and their shortfalls [m].
     kept : array, shape (uav, station)
@@ -253,15 +257,9 @@ def plan_run(
     bool
         Whether anything was in the way of the lanes or of the last profiles, or drew UAVs off them.
     """
-    prices = search.prices
     aside = prices.aside if stuck else -1.0
     uavs, fine, _ = profiles.shape
     need = search.radius_m + prices.spare_m
-    lattice = search.lattice
-    for i in range(uavs):
-        if largest_reach(covariance[i], search.margins.k, need) > search.wide_m:
-            lattice = search.wide
-            prices = search.wide_prices
     step = lattice.step_m / lattice.fine
     span = lattice.half * lattice.cell_m
     ahead = (lattice.stations - 1) * lattice.step_m
@@ -430,6 +428,99 @@ def plan_run(
     return True
 
 
+@compiled_bare
+def _large_ahead(boxes: SolidBoxes, scratch: Scratch, large_m: float) -> bool:
+    """Whether any UAV has found something of such a width."""
+    for i in range(scratch.found.shape[0]):
+        for entry in range(scratch.solid_count[i]):
+            solid = scratch.found[i, entry]
+            if boxes.high[solid, 1] - boxes.low[solid, 1] >= large_m:
+                return True
+    return False
+
+
+@compiled_bare
+def _farthest_aside(offset: Array, last: Array) -> float:
+    """Largest distance aside of UAVs (uav, 2) and their last profiles (uav, station, 2) [m]."""
+    farthest = 0.0
+    for i in range(offset.shape[0]):
+        farthest = max(farthest, abs(offset[i, 0]))
+        for s in range(last.shape[1]):
+            farthest = max(farthest, abs(last[i, s, 0]))
+    return farthest
+
+
+@compiled
+def plan_run(
+    solids: Solids,
+    boxes: SolidBoxes,
+    first: int,
+    stop: int,
+    frame: Frame,
+    field: SkyField,
+    run: int,
+    along: Array,
+    offset: Array,
+    lanes: Array,
+    covariance: Array,
+    separation: Array,
+    last: Array,
+    stuck: bool,
+    search: Search,
+    profiles: Array,
+    missing: Array,
+    kept: Array,
+    paid: Array,
+    scratch: Scratch,
+    far: bool,
+) -> tuple[bool, bool]:
+    """Plan the profiles of one run's UAVs on the lattice that they need, see :func:`_plan_on`.
+
+    That is the wide one for large margins, and the far one for what is large and leaves no way open on the
+    usual one.
+
+    Parameters
+    ----------
+    far : bool
+        Whether the last plan took the far lattice.
+    ... :
+        As for :func:`_plan_on`.
+
+    Returns
+    -------
+    busy, far : bool
+        Whether anything was in the way, and whether this plan took the far lattice.
+    """
+    lattice, prices = search.lattice, search.prices
+    need = search.radius_m + prices.spare_m
+    for i in range(len(along)):
+        if largest_reach(covariance[i], search.margins.k, need) > search.wide_m:
+            return _plan_on(
+                solids, boxes, first, stop, frame, field, run, along, offset, lanes, covariance, separation,
+                last, stuck, search, search.wide, search.wide_prices, profiles, missing, kept, paid, scratch,
+            ), far  # fmt: skip
+    # Who is far aside on the way round stays with the lattice that reaches there.
+    out = far and _farthest_aside(offset, last) > 0.5 * lattice.half * lattice.cell_m
+    busy = _plan_on(
+        solids, boxes, first, stop, frame, field, run, along, offset, lanes, covariance, separation, last,
+        stuck, search, search.far if out else lattice, prices, profiles, missing, kept, paid, scratch,
+    )  # fmt: skip
+    worst = missing.max()
+    if out or worst <= prices.spare_m + prices.tolerance_m:
+        return busy, out
+    if not _large_ahead(boxes, scratch, search.large_m):
+        return busy, False
+    near = profiles.copy(), missing.copy(), kept.copy()
+    _plan_on(
+        solids, boxes, first, stop, frame, field, run, along, offset, lanes, covariance, separation, last,
+        stuck, search, search.far, prices, profiles, missing, kept, paid, scratch,
+    )  # fmt: skip
+    if missing.max() < worst - prices.tolerance_m:
+        return busy, True
+    profiles[:], missing[:], kept[:] = near
+    return busy, False
+
+
 @compiled
 def _plan_runs(
     solids: Solids,
@@ -451,16 +542,17 @@ def _plan_runs(
     kept: Array,
     paid: Array,
     busy: NDArray[np.bool_],
+    far: NDArray[np.bool_],
     scratch: Scratch,
 ) -> None:
     for r in range(along.shape[0]):
         if not due[r]:
             continue
         scene = 0 if len(scene_start) == 2 else r
-        busy[r] = plan_run(
+        busy[r], far[r] = plan_run(
             solids, boxes, scene_start[scene], scene_start[scene + 1], frame, field, r, along[r], offset[r],
             lanes, covariance[r], separation[r], last[r], stuck[r], search, profiles[r], missing[r], kept[r],
-            paid[r], scratch,
+            paid[r], scratch, far[r],
         )  # fmt: skip
 
 
@@ -481,7 +573,7 @@ class _Kept(threading.local):
         self.scratch: Scratch | None = None
 
     def of(self, uavs: int, fine: int, most: int, search: Search) -> Scratch:
-        key = (uavs, fine, most, search.lattice, search.wide)
+        key = (uavs, fine, most, search.far, search.wide)
         if self.scratch is None or key != self.key:
             self.scratch = make_scratch(uavs, fine, most, search)
             self.key = key
@@ -511,13 +603,14 @@ def plan_all(
     kept: Array,
     paid: Array,
     busy: NDArray[np.bool_],
+    far: NDArray[np.bool_],
 ) -> None:
     """Plan all runs that are due, each from its own scene and state alone; see :func:`plan_run`."""
     # Powers of two, so that scenes of different size share scratch.
     most = min(MOST_SOLIDS, 1 << max(_largest_scene(scene_start) - 1, 1).bit_length())
     _plan_runs(
         solids, boxes, scene_start, frame, field, due, along, offset, lanes, covariance, separation, last,
-        stuck, search, profiles, missing, kept, paid, busy,
+        stuck, search, profiles, missing, kept, paid, busy, far,
         _KEPT.of(profiles.shape[1], profiles.shape[2], most, search),
     )  # fmt: skip
 

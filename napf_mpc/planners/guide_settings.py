@@ -29,7 +29,11 @@ class GuidanceSettings:
     cell_m: float = 1.0
     """Width of a lateral cell [m]."""
     widest_m: float = 30.0
-    """Largest lateral offset [m]."""
+    """Largest lateral offset [m], ..."""
+    farthest_m: float = 60.0
+    """... and where no other way leads past something as wide as ``large_m`` [m]."""
+    large_m: float = 20.0
+    """See there [m]."""
     layer_m: float = 2.0
     """Height of a layer [m]."""
     highest_m: float = 16.0
@@ -230,14 +234,17 @@ def search_of(
     room : HeightRoom, optional
         Limits to climbing and sinking.
     """
+    lattice = _lattice(settings, 1, room)
     return Search(
-        _lattice(settings, 1, room),
+        lattice,
+        lattice._replace(half=max(lattice.half, round(settings.farthest_m / settings.cell_m))),
         _lattice(settings, 2, room),
         settings.wide_m,
         _prices(settings, 1, open_sky_weight),
         _prices(settings, 2, open_sky_weight),
         margins,
         radius_m,
+        settings.large_m,
         room.ground_m,
         settings.passes,
         settings.pass_m,

@@ -218,6 +218,26 @@ def test_a_wide_wall_is_gone_round() -> None:
     assert Passage.NO_PASSAGE not in reasons(guides)
 
 
+@pytest.mark.parametrize(("width_m", "passed"), [(70.0, True), (96.0, True), (160.0, False)])
+def test_a_tower_wider_than_the_usual_detour_is_gone_round(width_m: float, passed: bool) -> None:
+    """Its sides are 35 m and more from the middle of the formation; ways lead 30 m aside, or 60 at most."""
+    made = guidance([Box((80.0, 0.0, 0.0), (40.0, width_m, ENDLESS))])
+    places, guides = follow(made, until_m=140.0, time_limit_s=160.0)
+    assert (Passage.NO_PASSAGE in reasons(guides)) != passed
+    assert (places[-1][:, 0].min() >= 140.0) == passed
+    assert clearance(made, places) > K_SIGMA - SETTINGS.squeeze_m
+    if passed:
+        assert np.abs(places[-1][:, 1:] - SLOTS[:, 1:]).max() < 3.0
+
+
+def test_a_row_of_small_things_takes_no_wide_detour() -> None:
+    """The wide lattice is coarse: it is for what is large, and all else is planned as ever."""
+    made = guidance([Cylinder((70.0, y), 3.0, -ENDLESS, ENDLESS) for y in np.arange(-50.0, 51.0, 5.0)])
+    _, guides = follow(made)
+    assert Passage.NO_PASSAGE in reasons(guides)
+    assert max(np.abs(guide.offset[..., 0]).max() for guide in guides) <= SETTINGS.widest_m + 1.0
+
+
 def test_a_low_wall_is_climbed() -> None:
     """Top 5 m above the lanes, far too wide to go round."""
     made = guidance([Box((60.0, 0.0, -45.0), (2.0, 400.0, 100.0))])
