@@ -414,6 +414,10 @@ def _inner_loop(law: TrackingLaw, nav: NavSolution, command: Command, active: Ma
         feedforward = np.array(feedforward, dtype=np.float64, order="C")
         planned, held = command.plan.at(nav.time_s)
         _show_plan(command.planned, plain(planned), plain(held), plain(command.yaw), shown, feedforward)
+        if command.tilt_thrust:
+            hold_up(
+                command.planned, plain(nav.attitude), law.hover_thrust, 4.0 * law.rotor_limit, feedforward
+            )
     return law.inputs(
         nav.position, nav.velocity, attitude, rates, position, velocity, direction, command.yaw, feedforward,
         active,
@@ -453,6 +457,41 @@ def _show_plan(
                 shown[4, run, uav, a] -= x[7 + 2 * a]
             for i in range(4):
                 feedforward[run, uav, i] = held[run, uav, i]
+
+
+MOST_THRUST = 0.8
+"""Part of the rotors' thrust that tilt may take: without the rest for torques nobody turns level again."""
+UPRIGHT = 0.5
+"""Least cosine of tilt that is made up for: beyond, UAVs are upset, and pushed aside by more thrust."""
+
+
+@compiled
+def hold_up(
+    follows: Mask, attitude: Array, hover_thrust: float, largest_thrust: float, feedforward: Array
+) -> None:
+    """Raise the thrust of plans to what holds up a tilted vehicle: over the cosine of its tilt.
+
+    The model about hover knows no loss of lift: with roll and pitch at their limits a quarter of it is gone,
+    and a UAV sinks by a metre in a second's turn.
+
+    Parameters
+    ----------
+    follows : array of bool, shape (run, uav)
+        Who follows a plan.
+    attitude : array, shape (run, uav, 3)
+        Roll, pitch and yaw as reported [rad].
+    hover_thrust, largest_thrust : float
+        Of the vehicle [N].
+    feedforward : array, shape (run, uav, 4)
+        Inputs about hover; thrust is written over, and never lowered.
+    """
+    for run in range(follows.shape[0]):
+        for uav in range(follows.shape[1]):
+            if follows[run, uav]:
+                upright = np.cos(attitude[run, uav, 0]) * np.cos(attitude[run, uav, 1])
+                wanted = (hover_thrust + feedforward[run, uav, 0]) / max(upright, UPRIGHT)
+                wanted = min(wanted, MOST_THRUST * largest_thrust) - hover_thrust
+                feedforward[run, uav, 0] = max(feedforward[run, uav, 0], wanted)
 
 
 @compiled

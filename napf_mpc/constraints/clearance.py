@@ -6,7 +6,8 @@ Around the last plan's position p_lin of a stage the shifted distance to an obst
 
 is linear in p: d the signed distance to the surface and n its unit gradient. Outside a convex obstacle the
 half-space holds none of it, so a row that is kept is never a mistake; for a prism with a courtyard it speaks
-of the nearest wall. Two shells of rows are made of it: contact, ``rho_bar >= 0``, whose penalty is exact, and
+of the nearest wall. Where a plan passes an edge between two stages, the half-space is that of the edge, see
+:mod:`.edges`. Two shells of rows are made of it: contact, ``rho_bar >= 0``, whose penalty is exact, and
 influence, ``rho_bar >= rho_0``, whose penalty pulls like NAPF.
 """
 
@@ -27,6 +28,7 @@ from napf_mpc.constraints.clearance_rows import (
     shortfalls,
 )
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows, even_prices
+from napf_mpc.constraints.edges import keep_edges
 from napf_mpc.constraints.passage import margins_beside, passage_margins
 from napf_mpc.constraints.probability import BALL, DISC, HALF_SPACE, exact_margins, sigma_along
 from napf_mpc.jit import compiled
@@ -106,18 +108,21 @@ class Gaps:
             return gaps
         reach = reach_m + radius + inflation.largest_margin(horizon.covariance)
         # An obstacle a little farther off may act more where the error is larger in its direction.
-        near = horizon.obstacles.near(place, reach.reshape(runs, uavs * stages), 2 * count, together=stages)
+        world = horizon.obstacles
+        near = world.near(place, reach.reshape(runs, uavs * stages), 2 * count, together=stages)
+        far, normal, index = near.distance.copy(), near.gradient.copy(), near.index
+        keep_edges(world.solids, world.scene_start, plain(place), stages, far, normal, index)
         shape, points = (runs, uavs, stages, 2 * count), runs * uavs * stages
-        normal, index = near.gradient.reshape(*shape, 3), near.index.reshape(shape)
+        normal, index = normal.reshape(*shape, 3), index.reshape(shape)
         sigma = _sigma(horizon.covariance, normal, inflation)
         if margin == "half_space":
             size = inflation.k * sigma
         else:
             size = (_exact if margin == "exact" else _passage)(horizon, index, normal, inflation)
         _choose(
-            near.distance.reshape(points, 2 * count),
-            near.gradient.reshape(points, 2 * count, 3),
-            near.index.reshape(points, 2 * count),
+            far.reshape(points, 2 * count),
+            normal.reshape(points, 2 * count, 3),
+            index.reshape(points, 2 * count),
             size.reshape(points, 2 * count),
             sigma.reshape(points, 2 * count),
             radius,
@@ -234,6 +239,7 @@ def _find_and_choose(
     distance, normal = np.empty((runs, each, m)), np.empty((runs, each, m, 3))
     index = np.empty((runs, each, m), dtype=np.int64)
     near_all(solids, tree, scene_start, points, reach, together, distance, normal, index)
+    keep_edges(solids, scene_start, points, together, distance, normal, index)
     flat, size, sigma = normal.reshape(total, m, 3), np.empty((total, m)), np.empty((total, m))
     _directional(certain, flat, sigma)
     for p in range(total):

@@ -2,7 +2,8 @@
 
 Rows speak of the side of an obstacle on which a plan is. A plan that was pressed into a wall, and far enough,
 has its later places on the other side; rows made there would help it through. So a plan is cut where it
-enters an obstacle: the places after that count as the last one before.
+enters an obstacle: the places after that count as the last one before. A way of guidance's may begin in an
+obstacle, or behind it; that counts as entered, too.
 """
 
 from __future__ import annotations
@@ -24,24 +25,51 @@ FINEST_M = 0.1
 """Steps between places are halved down to this length to find what stands between them."""
 
 
-def cut_at_obstacles(position: Array, obstacles: ObstacleSet) -> Array:
-    """Places (run, uav, N, 3) that stay where they are before they enter an obstacle [m].
+OWN_M = 1.0
+"""A plan that begins farther from the UAV than this is a way of guidance's, and looked at from the UAV on."""
 
-    A plan whose first place is inside an obstacle is left as it is: its rows lead out.
+
+def cut_at_obstacles(here: Array, position: Array, obstacles: ObstacleSet) -> Array:
+    """Places that stay where they are before they enter an obstacle.
+
+    Parameters
+    ----------
+    here : array, shape (run, uav, 3)
+        Where UAVs are reported to be [m].
+    position : array, shape (run, uav, N, 3)
+        Their plans [m].
+    obstacles : ObstacleSet
+        The map.
+
+    Returns
+    -------
+    array, shape (run, uav, N, 3)
+        Plans [m]. One of a UAV inside an obstacle that starts inside is left as it is: its rows lead out.
     """
     out = position.copy()
     if len(obstacles):
-        _cut(obstacles.solids, obstacles.tree, obstacles.scene_start, out)
+        _cut(obstacles.solids, obstacles.tree, obstacles.scene_start, here, out)
     return out
 
 
 @compiled
-def _cut(solids: Solids, tree: BoxTree, scene_start: NDArray[np.int64], out: Array) -> None:
+def _cut(solids: Solids, tree: BoxTree, scene_start: NDArray[np.int64], here: Array, out: Array) -> None:
     nodes, bounds = np.empty(STACK, dtype=np.int64), np.empty(STACK)
     for run in range(out.shape[0]):
         scene = 0 if len(scene_start) == 2 else run
         for uav in range(out.shape[1]):
-            before = out[run, uav, 0]
+            before, first = here[run, uav], out[run, uav, 0]
+            room = nearest_obstacle(solids, tree, scene, before[0], before[1], before[2], nodes, bounds)[0]
+            away = _length(before, first)
+            if (
+                away > OWN_M
+                and 0.0 < room <= away
+                and not _free(solids, tree, scene, before, first, room, away, nodes, bounds)
+            ):
+                for n in range(out.shape[2]):
+                    out[run, uav, n] = before
+                continue
+            before = first
             room = nearest_obstacle(solids, tree, scene, before[0], before[1], before[2], nodes, bounds)[0]
             if room <= 0.0:
                 continue

@@ -273,7 +273,8 @@ class Guidance:
                 self._profiles, along, self._step_m, self._lanes, self._frame, self._obstacles, margin,
                 self._clearance,
             )  # fmt: skip
-            pulled, loose = pulled_taut(*there, self.settings.taut_slope, self._kept)
+            farthest = np.where(self._far, self.settings.taut_m, np.inf)
+            pulled, loose = pulled_taut(*there, self.settings.taut_slope, self._kept, farthest)
             room = np.zeros(loose.shape)
             if self._room_m > 0.0:
                 room = room_outwards(*there, self._room_m)

@@ -16,6 +16,7 @@ from napf_mpc.jit import compiled_bare
 from napf_mpc.planners.guide_clearance import (
     ALONG,
     HIGH,
+    LARGE_M,
     LEFT,
     LOW,
     OUTER2,
@@ -203,8 +204,8 @@ def take_solids(
 
     With a positive weight, linearised shortfalls are added to the profile's band system too. Where the
     distance grows along the path only, as before a wall, its gradient does not tell which way to give: there
-    the profile is drawn to its draft. Where drafts are level, a sphere pushes nobody up or down: along its
-    surface it would push a way past its side under itself, where no way has been looked for.
+    the profile is drawn to its draft. Where drafts are level, a large sphere pushes nobody up or down: along
+    its surface it would push a way past its side under itself, where no way has been looked for.
     """
     missing[:] = 0.0
     own, right = band.own, band.right
@@ -258,7 +259,7 @@ def take_solids(
             missing[s] = max(missing[s], short)
             if weight <= 0.0 or short <= 0.0:
                 continue
-            if level and ball > 0.0:
+            if level and near[i, entry, ROUND] > 0.0 and near[i, entry, RADIUS] >= LARGE_M:
                 g1 = 0.0
             across = math.sqrt(g0 * g0 + g1 * g1)
             if across < LEAST_ACROSS:

@@ -21,6 +21,8 @@ from napf_mpc.world.obstacles import ObstacleSet
 
 Array = NDArray[np.float64]
 
+LARGE_M = 8.0
+"""Radius from which a sphere in the air is passed like a building: by a way under it, if one is found."""
 ENDLESS_M = 1e4
 """Heights beyond this count as this when a solid's box is turned into the path's frame."""
 
@@ -310,14 +312,17 @@ def vertical_room(
     """Whether it makes sense to go up past what was found, whether all are spheres, and how far down to go.
 
     Up: something has a top that can be passed within ``most_up`` metres. Down is to where the first of them
-    can be passed beneath [m], endless if nothing was found.
+    can be passed beneath [m], endless if nothing was found; small spheres that cannot be passed above are
+    passed at the side.
     """
     upwards = False
     spheres = True
     down = np.inf
     for entry in range(count):
         i = found[entry]
+        small = solids.kind[i] == SPHERE and solids.parameters[i, A] < LARGE_M
         spheres = spheres and solids.kind[i] == SPHERE
         upwards = upwards or boxes.high[i, 2] + reach - lane_up <= most_up
-        down = min(down, lane_up + reach - boxes.low[i, 2])
+        if not small:
+            down = min(down, lane_up + reach - boxes.low[i, 2])
     return upwards, spheres, down

@@ -265,7 +265,7 @@ def _plan_on(
     ahead = (lattice.stations - 1) * lattice.step_m
     found, count, reach = scratch.found, scratch.solid_count, scratch.reach
     upwards = False
-    spheres = True
+    over_all = spheres = True
     farthest = 0.0
     down = np.inf
     for i in range(uavs):
@@ -279,12 +279,14 @@ def _plan_on(
             solids, boxes, found[i], count[i], lanes[i, 1], reach[i], lattice.layers * lattice.layer_m
         )
         upwards = upwards or up
+        over_all = over_all and (up or count[i] == 0)
         spheres = spheres and alike
         down = min(down, depth)
     to_ground = int(min(max(search.ground_room_m - farthest, 0.0), ENDLESS_M) / lattice.layer_m)
     # Past spheres down is as good as up; past what stands on the ground there is no down, ...
     below = min(lattice.sphere_layers // 2, to_ground)
-    if spheres and below > 0 and (upwards or down <= below * lattice.layer_m):
+    helps = over_all if upwards else down <= below * lattice.layer_m
+    if spheres and below > 0 and helps:
         layers = 1 + 2 * below
     else:
         # ... unless something hangs in the air, so near that it is known that no ground is below.

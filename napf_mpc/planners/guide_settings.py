@@ -89,6 +89,9 @@ class GuidanceSettings:
     """One way for all is taken if it costs less than this share of individual ways."""
     taut_slope: float = 0.35
     """Slope at which a way that was pulled taut leads back to where it must be kept."""
+    taut_m: float = 15.0
+    """A way on the far lattice is drawn this far at most. Behind the end of a long wall nothing holds it, and
+    a lane 40 m away pulls at a UAV so hard that it cuts the corner [m]."""
     flown_slope: float = 1.4
     """Slope that is flown at full pace."""
     bend_m: float = 6.0

@@ -34,6 +34,7 @@ from napf_mpc.planners.fallback import Action, Codes, Ladder
 from napf_mpc.planners.guess import cut_at_obstacles
 from napf_mpc.planners.guidance import Guidance, guidance_covariance
 from napf_mpc.planners.guide import Guide
+from napf_mpc.planners.guide_settings import GuidanceSettings
 from napf_mpc.planners.guided_field import waiting_reasons
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
 from napf_mpc.planners.planner import Command
@@ -78,6 +79,11 @@ LEAVING_MPS, LEAVING_RAW_MPS = 2.0, 0.3
 metres: who leaves faster than errors fade flies after them."""
 THRUST_WEIGHT, TORQUE_WEIGHT = 60.0, 600.0
 """``planner.thrust_weight`` and ``planner.torque_weight`` of the paper's vehicle, in their units."""
+FAST_MPS = GuidanceSettings.usual_mps
+"""Formation speed beyond which prices, thrust and, see there, guidance are others."""
+CONTACT_PRICE, FAST_CONTACT_PRICE = 300.0, 3000.0
+"""``planner.contact_price`` up to and beyond that. The slot of a UAV that waits at a corner runs away by ten
+metres in the seconds of a horizon, all of which pull at the few stages on which the corner is cut."""
 SPEED_PRICE = (1000.0, 1000.0)
 """Prices of a speed slack: above what the margins can gain by it, so that no margin buys a dash."""
 _CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
@@ -94,7 +100,7 @@ def default_constraints(problem: Problem) -> list[Constraint]:
     settings, leaving = problem.planner, problem.planner.leaving_mps
     if leaving is None:
         leaving = LEAVING_RAW_MPS if problem.navigation.filter == "none" else LEAVING_MPS
-    rows, price, margin = settings.obstacle_rows, settings.contact_price, settings.margin
+    rows, price, margin = settings.obstacle_rows, contact_price(problem), settings.margin
     inflation = Inflation.of_problem(problem)
     contact = ObstacleContact(
         inflation,
@@ -129,6 +135,18 @@ def default_constraints(problem: Problem) -> list[Constraint]:
         others.append(AltitudeBand(low, high, opening_mps=pace))
     speed = SpeedLimit(w1=SPEED_PRICE[0], w2=SPEED_PRICE[1])
     return [contact, influence, *others, speed, TiltLimit(), InputBox()]
+
+
+def contact_price(problem: Problem) -> float:
+    """Price of a margin as a problem's settings ask for it [1/(m s)]."""
+    asked = problem.planner.contact_price
+    if asked is not None:
+        return asked
+    return FAST_CONTACT_PRICE if _is_fast(problem) else CONTACT_PRICE
+
+
+def _is_fast(problem: Problem) -> bool:
+    return isinstance(problem.mission, FormationMission) and problem.mission.speed_mps > FAST_MPS
 
 
 def weights(settings: Settings, vehicle: Vehicle) -> tuple[Array, Array]:
@@ -204,6 +222,7 @@ class QpPlanner:
         self._short = ShortMargins(problem, self._inflation) if problem.uav_count > 1 else None
         self._lanes = self._frame.to_world(self._slots.offsets * np.array([0.0, 1.0, 1.0]))
         self._descent = Descent(problem)
+        self._tilt_thrust = _is_fast(problem) if settings.tilt_thrust is None else settings.tilt_thrust
         self._period_s = 1.0 / settings.rate_hz
         step = stage_grid(self._period_s, settings.horizon, settings.look_ahead_s)
         self._grid = np.append(0.0, step)  # now, and the ends of the stages
@@ -255,7 +274,7 @@ class QpPlanner:
         covariance = self._covariance(nav, trusted, self._planned(state, carried))
         reference, way = self._references(state, carried, nav, covariance, trusted, None)
         guess, _ = self._guess(state, way, carried, time_s)
-        horizon = self._horizon(guess, covariance, nav, trusted, time_s)
+        horizon = self._horizon(_place(state), guess, covariance, nav, trusted, time_s)
         return self._programs(state, _place(state), reference, horizon)
 
     def step(self, nav: NavSolution, time_s: float) -> Command:
@@ -338,6 +357,7 @@ class QpPlanner:
             feedforward=np.zeros((*trusted.shape, 4)),
             plan=flown,
             planned=planned,
+            tilt_thrust=self._tilt_thrust,
             reason=reason,
             slack_m=slack,
             solver_status=_WORDS.take(answer.status),
@@ -425,14 +445,14 @@ class QpPlanner:
         return states, inputs
 
     def _horizon(
-        self, guess: Array, covariance: Array, nav: NavSolution, trusted: Mask, time_s: float
+        self, place: Array, guess: Array, covariance: Array, nav: NavSolution, trusted: Mask, time_s: float
     ) -> Horizon:
         position, velocity = np.empty((2, *guess.shape[:3], 3))
         passes.places(plain(guess), position, velocity)
         return Horizon(
             time_s=time_s,
             step_s=self._model.step_s,
-            position=cut_at_obstacles(position, self._obstacles),
+            position=cut_at_obstacles(place, position, self._obstacles),
             velocity=velocity,
             covariance=covariance,
             common_factor=_shared_ahead(nav, trusted, covariance),
@@ -498,7 +518,7 @@ class QpPlanner:
                 better = np.asarray(np.isfinite(answer.states).all(axis=(2, 3), keepdims=True))
                 states = np.where(better, _moved(answer.states, origin), states)
                 inputs = np.where(better, answer.inputs, inputs)
-            self._last_horizon = self._horizon(states, covariance, nav, trusted, time_s)
+            self._last_horizon = self._horizon(origin, states, covariance, nav, trusted, time_s)
             programs = self._programs(state, origin, reference, self._last_horizon)
             warm = None
             if self._answer is not None:

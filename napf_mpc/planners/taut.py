@@ -60,6 +60,7 @@ def pulled_taut(
     clearance: Clearance,
     slope: float,
     stay: Array | None = None,
+    farthest: Array | None = None,
 ) -> tuple[Array, Array]:
     """Offsets as near to the lanes as the margins allow, and how loose they are.
 
@@ -85,6 +86,8 @@ def pulled_taut(
         At which a place leads back to the way, per metre of path.
     stay : array, shape (run, uav, station), optional
         How far from the lane a place stays though nothing is in between, as where the sky is better [m].
+    farthest : array, shape (run,), optional
+        How far a place is drawn at most [m].
 
     Returns
     -------
@@ -97,9 +100,11 @@ def pulled_taut(
     loose = np.ones(profiles.shape[:3])
     if stay is None:
         stay = np.zeros(profiles.shape[:3])
+    if farthest is None:
+        farthest = np.full(len(profiles), np.inf)
     _pull(
         obstacles.solids, obstacles.tree, obstacles.scene_start, along, step_m, lanes, frame, covariance,
-        clearance, slope * step_m, stay, out, loose,
+        clearance, slope * step_m, stay, farthest, out, loose,
     )  # fmt: skip
     return out, loose
 
@@ -157,6 +162,7 @@ def _pull(
     clearance: Clearance,
     most: float,
     stay: Array,
+    farthest: Array,
     out: Array,
     loose: Array,
 ) -> None:
@@ -175,7 +181,7 @@ def _pull(
                 left, up = out[run, uav, s]
                 size = math.sqrt(left * left + up * up)
                 # Backwards: from here, what lies ahead has to be reached at no more than the slope.
-                limit = min(size - (ahead - most), size - stay[run, uav, s])
+                limit = min(size - (ahead - most), size - stay[run, uav, s], farthest[run])
                 ahead = size
                 if size < SAME_M or limit <= 0.0:
                     loose[run, uav, s] = 1.0 if size < SAME_M else 0.0

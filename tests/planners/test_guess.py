@@ -17,7 +17,7 @@ def straight(start: float, step: float, stages: int = 10) -> Array:
 
 
 def cut(plan: Array, *shapes: Shape) -> Array:
-    return cut_at_obstacles(plan, ObstacleSet.from_shapes(list(shapes)))[0, 0, :, 0]
+    return cut_at_obstacles(plan[:, :, 0], plan, ObstacleSet.from_shapes(list(shapes)))[0, 0, :, 0]
 
 
 def test_a_wall_thinner_than_a_step_stops_the_plan() -> None:
@@ -37,6 +37,17 @@ def test_one_that_starts_inside_leads_out() -> None:
     np.testing.assert_array_equal(cut(plan, Sphere((0.5, 0.0, 0.0), 2.0)), plan[0, 0, :, 0])
 
 
+def test_one_that_starts_inside_or_behind_what_the_uav_is_outside_of_stays_where_that_is() -> None:
+    """A way that begins in a wall, as a slot may in a hold, would lead out on any side of it."""
+    wall = ObstacleSet.from_shapes([Box((9.0, 0.0, 0.0), (4.0, 10.0, 10.0))])
+    here = np.array([[[6.0, 0.5, 0.0]]])
+    for start in (8.0, 12.0):
+        left = cut_at_obstacles(here, straight(start, 0.5), wall)
+        np.testing.assert_array_equal(left, np.broadcast_to(here[:, :, None], left.shape))
+    inside = np.array([[[8.5, 0.5, 0.0]]])  # who is inside keeps its plan, which leads out
+    np.testing.assert_array_equal(cut_at_obstacles(inside, straight(8.0, 0.5), wall), straight(8.0, 0.5))
+
+
 def test_against_dense_sampling() -> None:
     """Random plans among random spheres: no piece of what is left enters one, and what is cut would have."""
     rng = np.random.default_rng(3)
@@ -49,7 +60,7 @@ def test_against_dense_sampling() -> None:
         plan = np.cumsum(rng.normal(0.0, 1.0, (1, 1, 12, 3)), axis=2)
         if world.signed_distance(plan[:, 0, :1])[0, 0] <= 0.0:
             continue
-        left = cut_at_obstacles(plan, world)[0, 0]
+        left = cut_at_obstacles(plan[:, :, 0], plan, world)[0, 0]
         kept = int((left == plan[0, 0]).all(-1).sum())
         at = np.linspace(0.0, 1.0, 400)[:, None]
 
