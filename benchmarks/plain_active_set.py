@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
+from scipy.optimize import nnls
 
 from napf_mpc.constraints.constraint import SIGNALS, LinearRows
 from napf_mpc.qp import HorizonModel, HorizonQp, QpStatus
 
 Array = NDArray[np.float64]
 INF = np.inf
+FAR = 1e6
+"""How many times as far as the farthest hard row alone plans must lie that are taken for none."""
 
 
 class PlainActiveSet:
@@ -59,8 +62,30 @@ class PlainActiveSet:
                             -1 if not block.soft else first if block.shared_slack else first + j
                         )
 
+    def contradictory(self) -> bool:
+        """Whether no plan within reach meets all hard rows.
+
+        In the cost's measure, with the farthest row alone at a distance of one, the nearest plan that meets
+        ``N u >= m`` lies at ``rho``, and ``1 / (1 + rho^2)`` is the least ``|N' d|^2 + (m' d - 1)^2`` over
+        ``d >= 0``: at zero the weights d are a certificate of Farkas.
+        """
+        hard = np.flatnonzero(np.array(self.groups) < 0)
+        if not hard.size:
+            return False
+        normals, bounds = np.array(self.normals)[hard], np.array(self.bounds)[hard]
+        rows = solve_triangular(np.linalg.cholesky(self.hessian), normals.T, lower=True).T
+        miss, length = bounds - normals @ self.free, np.linalg.norm(rows, axis=1)
+        moves = length > 0.0
+        if (miss[~moves] > 0.0).any():
+            return True
+        rows, miss = rows[moves] / length[moves, None], miss[moves] / length[moves]
+        if not (miss > 0.0).any():
+            return False
+        both = np.vstack([rows.T, miss / np.abs(miss).max()])
+        return bool(nnls(both, np.eye(len(both))[-1], maxiter=30 * both.shape[1])[1] < 1.0 / FAR)
+
     def solve(self) -> tuple[QpStatus, Array]:
-        """Status and inputs (4 N,)."""
+        """Status and inputs (4 N,); inaccurate if rounding alone says that rows contradict each other."""
         if not self.normals:
             return QpStatus.SOLVED, self.free
         normals, bounds, groups = np.array(self.normals), np.array(self.bounds), np.array(self.groups)
@@ -102,7 +127,8 @@ class PlainActiveSet:
                 ]
                 length, event, which = min(lengths)
                 if length == INF:
-                    return QpStatus.PRIMAL_INFEASIBLE, self.free * np.nan
+                    none = self.contradictory()
+                    return QpStatus.PRIMAL_INFEASIBLE if none else QpStatus.INACCURATE, self.free * np.nan
                 mult += length * change
                 left -= length * fresh
                 if event == "drop":
@@ -116,4 +142,5 @@ class PlainActiveSet:
                 is_open[group] = False
             else:
                 members.append(row)
-        return QpStatus.MAX_ITERATIONS, self.free * np.nan
+        none = self.contradictory()
+        return QpStatus.PRIMAL_INFEASIBLE if none else QpStatus.MAX_ITERATIONS, self.free * np.nan

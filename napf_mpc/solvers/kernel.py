@@ -16,8 +16,8 @@ import numpy as np
 from napf_mpc.constraints.constraint import LinearRows
 from napf_mpc.qp import STATES, Array, HorizonModel, HorizonQp, Index, Layout, QpError, QpStatus
 from napf_mpc.solvers.batch import STATUSES, BatchResult, Mask, WarmStart, checked_guess, why_unusable
-from napf_mpc.solvers.kernel_active_set import INFEASIBLE, LIMIT, OPTIMAL, WorkingSet
-from napf_mpc.solvers.kernel_program import ROUGH, UNUSABLE, Kept, Room, solve_programs
+from napf_mpc.solvers.kernel_active_set import LIMIT, OPTIMAL, WorkingSet
+from napf_mpc.solvers.kernel_program import INFEASIBLE, ROUGH, STUCK, UNUSABLE, Kept, Room, solve_programs
 from napf_mpc.solvers.kernel_rows import RowPlaces, RowTable, gather
 from napf_mpc.solvers.kernel_signals import SignalMaps, signal_maps
 from napf_mpc.solvers.kernel_sweep import Lanes
@@ -30,11 +30,13 @@ _STATUS = {
     LIMIT: QpStatus.MAX_ITERATIONS,
     ROUGH: QpStatus.INACCURATE,
     UNUSABLE: QpStatus.FAILED,
+    STUCK: QpStatus.INACCURATE,
 }
 _MESSAGES = {
     INFEASIBLE: "hard rows contradict each other",
     LIMIT: "the limit of steps is reached",
     ROUGH: "a KKT residual is above 1e-9 of its largest term",
+    STUCK: "rounding ends the method: a row can neither be met nor be shown to contradict hard rows",
 }
 
 

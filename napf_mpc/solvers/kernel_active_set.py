@@ -26,8 +26,8 @@ from napf_mpc.qp import STATES, Array, Index
 from napf_mpc.solvers.kernel_rows import HIGH, LOW, WIDTH, RowPlaces
 from napf_mpc.solvers.kernel_signals import SignalMaps
 
-OPTIMAL, INFEASIBLE, LIMIT = 0, 1, 2
-"""How the method ends."""
+OPTIMAL, UNBOUNDED, LIMIT = 0, 1, 2
+"""How the method ends; unbounded is the dual, if what the new multiplier does meets no end."""
 DEPENDENT = 1e-11
 """A row of which less than this part is new to the working set depends on it."""
 TOUCH = 1e-11
@@ -472,6 +472,17 @@ def rounding(program: Program, work: WorkingSet, n: int) -> float:
     return float(TOUCH + ROUNDING * total)
 
 
+@compiled_apart
+def point(work: WorkingSet, waiting: int) -> None:
+    """Replace the multipliers by the direction in which they grow without end; a row that waits joins in."""
+    n = work.counter[WORKING]
+    for j in range(n):
+        work.mult[j] = -work.step[j]
+    if waiting > 0:
+        work.mult[n] = 1.0
+    work.counter[WORKING] = n + waiting
+
+
 @compiled_bare
 def ascend(
     program: Program, maps: SignalMaps, work: WorkingSet, base: Array, signals: Array, plane: Array,
@@ -499,7 +510,8 @@ def ascend(
     Returns
     -------
     int
-        :data:`OPTIMAL`, :data:`INFEASIBLE` or :data:`LIMIT`.
+        :data:`OPTIMAL`, :data:`LIMIT`, or :data:`UNBOUNDED`: the members' multipliers then are a direction,
+        which rounding alone may have made, see :mod:`~napf_mpc.solvers.kernel_contradiction`.
     """
     work.counter[SUSPECTS] = 0
     for r in range(len(work.member)):
@@ -529,6 +541,8 @@ def ascend(
         waiting = 1 if is_row else 0
         while True:
             if work.counter[STEPS] >= limit:
+                # A row that waits has a multiplier, too.
+                work.counter[WORKING] += waiting
                 return LIMIT
             work.counter[STEPS] += 1
             n = work.counter[WORKING]
@@ -569,7 +583,8 @@ def ascend(
                         length, blocking, opening = room / work.rate[other], -1, other
             if length == np.inf:
                 if not is_row or work.mult[n] > 0.0 or violation > rounding(program, work, n):
-                    return INFEASIBLE
+                    point(work, waiting)
+                    return UNBOUNDED
                 # It depends on the members, and misses its bound by no more than their own rounding.
                 release(program, work, n, n + 1)
                 work.member[found] |= SET_ASIDE

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from napf_mpc.jit import compiled_apart, compiled_bare
 from napf_mpc.qp import INPUTS, STATES, Array, Index
 from napf_mpc.solvers.kernel_active_set import (
-    INFEASIBLE,
     LIMIT,
     OPTIMAL,
     STEPS,
+    UNBOUNDED,
     WORKING,
     Program,
     WorkingSet,
@@ -28,6 +28,7 @@ from napf_mpc.solvers.kernel_active_set import (
     row_value,
     sums,
 )
+from napf_mpc.solvers.kernel_contradiction import contradiction, room_for_sums
 from napf_mpc.solvers.kernel_rows import HIGH, LOW, W1, W2, WIDTH, RowPlaces, RowTable
 from napf_mpc.solvers.kernel_signals import SignalMaps
 from napf_mpc.solvers.kernel_sweep import (
@@ -39,8 +40,9 @@ from napf_mpc.solvers.kernel_sweep import (
     unload,
 )
 
-ROUGH, UNUSABLE, ALONE = 3, 4, 5
-"""Further ends of a program: the certificate is not met; a number is not sound; it is to be solved alone."""
+INFEASIBLE, ROUGH, UNUSABLE, STUCK, ALONE = 1, 3, 4, 5, 6
+"""Further ends of a program: hard rows contradict each other, by a certificate; the KKT conditions are not
+met; a number is not sound; rounding ends the method; it is to be solved alone."""
 EXACT, PLAIN = 1e-9, 1e-10
 """Largest KKT residual of a solved program, over one or its own largest term; and of one that is solved
 without corrections."""
@@ -92,6 +94,8 @@ class Room(NamedTuple):
     """(capacity,) members before it."""
     side: Array
     """(capacity,) their sides."""
+    sums: Array
+    """(7, 16) for weighted sums of hard rows."""
 
     @classmethod
     def empty(cls, stages: int, soft: int, members: int) -> Room:
@@ -101,7 +105,7 @@ class Room(NamedTuple):
         return cls(
             np.zeros(plane.size), plane.reshape(-1), plane, exact.reshape(-1), exact, np.zeros(6),
             np.zeros(soft), np.zeros(soft), np.zeros(soft), np.zeros(soft, dtype=np.bool_),
-            np.zeros(members, dtype=np.int64), np.zeros(members),
+            np.zeros(members, dtype=np.int64), np.zeros(members), room_for_sums(),
         )  # fmt: skip
 
 
@@ -414,6 +418,14 @@ def certify(
     return worst
 
 
+@compiled_bare
+def is_contradictory(
+    program: Program, maps: SignalMaps, table: RowTable, work: WorkingSet, room: Room
+) -> bool:  # fmt: skip
+    """Whether the multipliers reached prove hard rows to contradict each other; spoils the working set."""
+    return contradiction(program, maps, work, table.price.shape[2], room.base, room.signals, room.sums)
+
+
 @compiled_apart
 def solve_alone(
     maps: SignalMaps, program: Program, table: RowTable, u: int, work: WorkingSet, room: Room, lanes: Lanes,
@@ -442,7 +454,17 @@ def solve_alone(
             if certify(program, table, u, work, room, lanes, 0, at, z, y) <= EXACT:
                 return OPTIMAL
             status = ROUGH
-        if strict or status == LIMIT or (status == INFEASIBLE and not guessed):
+        # Multipliers that grew without end tell the same as a direction in which they would.
+        last = strict or status == LIMIT
+        if last or status == UNBOUNDED:
+            # Corrections under forces that large leave no digit of the optimum without rows.
+            sweep(maps, lanes, False)
+            read_signals(maps, lanes, 0, room.base)
+            if is_contradictory(program, maps, table, work, room):
+                return INFEASIBLE
+        if status == UNBOUNDED:
+            status = STUCK
+        if last:
             return status
         strict = not guessed
     return status
@@ -463,7 +485,11 @@ def begin(
     if guessed:
         resume(program, work, room.base)
     status = ascend(program, maps, work, room.base, room.signals, room.plane, limit)
-    return ALONE if guessed and status == INFEASIBLE else status
+    if status == OPTIMAL:
+        return status
+    if is_contradictory(program, maps, table, work, room):
+        return INFEASIBLE
+    return ALONE if status == UNBOUNDED else status
 
 
 @compiled_bare

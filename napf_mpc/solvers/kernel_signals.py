@@ -56,6 +56,8 @@ class SignalMaps(NamedTuple):
     """(13, N) diagonal of the kernel, in its order: how easily each signal is moved."""
     softest: float
     """Its largest entry: no unit row is easier to move."""
+    dynamics: Array
+    """(N, 12, 16) what a stage makes of states and inputs, for programs that fail."""
 
 
 def signal_maps(model: HorizonModel) -> SignalMaps:
@@ -103,6 +105,7 @@ def signal_maps(model: HorizonModel) -> SignalMaps:
         np.tile(np.arange(n), len(TARGETS)).astype(np.uint32),
         np.ascontiguousarray(np.diag(kernel)[at]).reshape(len(TARGETS), n),
         float(np.diag(kernel).max()),
+        np.concatenate([model.a, model.b], axis=2),
     )
 
 

@@ -311,6 +311,86 @@ def test_hard_rows_that_contradict_each_other_are_infeasible_and_harm_no_other()
     assert (np.delete(result.status.ravel(), 2) == SOLVED).all()
 
 
+def dear(seed: int) -> HorizonQp:
+    """Soft rows of sizes and prices that leave them no digit; there is no hard row."""
+    rng, stages, rows = np.random.default_rng(seed), len(GRID), 8
+    jac = rng.normal(size=(1, 1, stages, rows, 3))
+    jac *= 10.0 ** rng.uniform(-6.0, 6.0, size=(1, 1, stages, rows, 1))
+    bound = np.linalg.norm(jac, axis=-1) * rng.normal(size=(1, 1, stages, rows))
+    price = everywhere([1e6] * rows)
+    return one(LinearRows("position", jac, bound, bound, price, price))
+
+
+@pytest.mark.parametrize("seed", [7, 8, 13])
+def test_soft_rows_never_make_a_program_infeasible(seed: int) -> None:
+    """Where rounding ends the method, the answer is none, and says no more than that."""
+    result = make_batch_solver("kernel").solve_batch(dear(seed))
+    assert result.status[0, 0] == CODE[QpStatus.INACCURATE]
+    assert "hard rows contradict" not in result.messages[0, 0]
+
+
+def test_the_method_in_plain_numpy_does_not_call_soft_rows_infeasible() -> None:
+    soft = dear(7)
+    hard = replace(soft, rows=tuple(replace(block, w1=None, w2=None) for block in soft.rows))
+    assert PlainActiveSet(soft, 0, 0).solve()[0] is QpStatus.INACCURATE
+    # The same rows have no slack to give then.
+    assert PlainActiveSet(hard, 0, 0).contradictory()
+    assert make_batch_solver("kernel").solve_batch(hard).status[0, 0] == CODE[QpStatus.PRIMAL_INFEASIBLE]
+
+
+def lifted(height_m: Array, force: float = 0.5, above: float = 0.0) -> HorizonQp:
+    """A UAV that must be at heights (N,) at least, with inputs within a box."""
+    box = LinearRows("input", everywhere(np.eye(4)), everywhere([-force] * 4), everywhere([force] * 4))
+    low = (height_m + above)[None, None, :, None]
+    return one(box, LinearRows("position", everywhere([[0.0, 0.0, 1.0]]), low), mixed(3, 1, 1).rows[0])
+
+
+def highest_m(force: float = 0.5) -> Array:
+    """(N,) heights under the largest thrust."""
+    model, state, heights = hover_model(), np.zeros(12), []
+    for a, b in zip(model.a, model.b, strict=True):
+        state = a @ state + b[:, 0] * force
+        heights.append(state[4])
+    return np.array(heights)
+
+
+@pytest.mark.parametrize("beyond", [1e-5, 1.0, 107.0])
+def test_hard_rows_beyond_what_the_inputs_reach_are_infeasible(beyond: float) -> None:
+    """The farther, the more rounding there is in multipliers that grow without end."""
+    horizon = lifted(highest_m(), above=beyond)
+    result = make_batch_solver("kernel").solve_batch(horizon)
+    assert result.status[0, 0] == CODE[QpStatus.PRIMAL_INFEASIBLE]
+    assert result.messages[0, 0] == "hard rows contradict each other"
+    assert PlainActiveSet(horizon, 0, 0).solve()[0] is QpStatus.PRIMAL_INFEASIBLE
+
+
+@pytest.mark.parametrize("room", [1e-5, 1e-2])
+def test_hard_rows_just_within_what_the_inputs_reach_are_solved(room: float) -> None:
+    certified(lifted(highest_m(), above=-room))
+
+
+@pytest.mark.parametrize("beside_m", [107.0, 1e4])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_hard_rows_far_beside_the_path_are_infeasible(beside_m: float, axis: int) -> None:
+    """Multipliers then grow by decades; rounding ends the method before it meets a direction without end."""
+    model = hover_model(*MODELS["even"])
+    horizon = mixed(1, 2, 2, model)
+    shape = (*horizon.shape, 1)
+    jac, low = np.zeros((*shape, 3)), np.full(shape, beside_m)
+    jac[..., axis] = 1.0
+    rows = (*horizon.rows, LinearRows("position", jac, low, low + 100.0))
+    result = make_batch_solver("kernel").solve_batch(replace(horizon, rows=rows))
+    assert (result.status == CODE[QpStatus.PRIMAL_INFEASIBLE]).all()
+    assert set(result.messages.values()) == {"hard rows contradict each other"}
+
+
+def test_a_limit_of_steps_that_hard_rows_run_into_says_so() -> None:
+    """One step tells: no input within its limits reaches a row that is that far away."""
+    result = make_batch_solver("kernel", max_iter=1).solve_batch(lifted(highest_m(), above=107.0))
+    assert result.messages[0, 0] == "hard rows contradict each other"
+    assert result.iterations[0, 0] == 1
+
+
 def test_a_row_without_coefficients() -> None:
     zero = wall(1.0, 5.0, 1.0, sign=0.0)
     np.testing.assert_array_equal(certified(one(zero)).states, certified(one()).states)
