@@ -135,6 +135,8 @@ def _allowed(node: Node) -> str:
     match node.get("type"):
         case "number" | "integer":
             return ("whole, " if node["type"] == "integer" else "") + _range(node)
+        case "boolean":
+            return "true, false"
         case "string":
             return f"text of {_count(node, 'Length')} characters"
         case "array" if "prefixItems" in node:

@@ -10,7 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from napf_mpc.campaign import fly_block, simulate
-from napf_mpc.closed_loop import POSITION, VELOCITY, Scenario, build_scenario, closed_loop, initial_state
+from napf_mpc.closed_loop import (
+    POSITION,
+    VELOCITY,
+    Scenario,
+    build_scenario,
+    closed_loop,
+    hold_up,
+    initial_state,
+)
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
 from napf_mpc.formation import PathFrame, formation_offsets
@@ -582,3 +590,36 @@ def test_a_run_does_not_wait_once_it_has_ended() -> None:
     assert len(set(flight.finish_time_s.tolist())) > 2
     assert flight.waited_s is not None
     np.testing.assert_allclose(flight.waited_s, flight.finish_time_s, atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------ thrust for tilt
+
+
+def test_thrust_makes_up_for_tilt_within_what_rotors_can_spare() -> None:
+    follows = np.array([[True, True, True, False]])
+    tilt = np.array([0.0, 0.5, 1.4, 0.5])
+    attitude = np.zeros((1, 4, 3))
+    attitude[0, :, 0], attitude[0, 1, 1] = tilt, -0.4
+    feedforward = np.zeros((1, 4, 4))
+    feedforward[..., 0], feedforward[..., 1] = 1.0, 0.2
+    hold_up(follows, attitude, 10.0, 25.0, feedforward)
+    held = (10.0 + feedforward[0, :, 0]) * np.cos(attitude[0, :, 0]) * np.cos(attitude[0, :, 1])
+    np.testing.assert_allclose(held[:2], 11.0)  # as a vehicle that is level
+    assert feedforward[0, 2, 0] == pytest.approx(0.8 * 25.0 - 10.0)  # the rest is for torques
+    assert feedforward[0, 3, 0] == 1.0  # who follows no plan
+    np.testing.assert_array_equal(feedforward[..., 1], 0.2)
+    asked = np.full((1, 1, 4), 12.0)
+    hold_up(follows[:, :1], attitude[:, :1], 10.0, 25.0, asked)
+    assert asked[0, 0, 0] == 12.0  # never lowered, also beyond what tilt may take
+
+
+def test_a_fast_formation_does_not_sink_when_it_takes_off() -> None:
+    """To 8 m/s it tilts to its limits for seconds; without thrust for that it loses metres."""
+    lowest = {}
+    for tilt in ("true", "false"):
+        problem = empty("mission.speed_mps=8", f"planner.tilt_thrust={tilt}")
+        _, columns = fly(problem, make_planner("qp", problem), build_scenario(problem, 3, range(1)), 20)
+        first = (columns["uav"] == 0) & (columns["t_s"] < 4.0)  # it starts at the height of its lane
+        lowest[tilt] = columns["z_m"][first].min()
+    assert lowest["true"] > -0.6
+    assert lowest["false"] < -1.2

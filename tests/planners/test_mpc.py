@@ -14,11 +14,12 @@ from napf_mpc.block import simulate
 from napf_mpc.constraints.clearance import ObstacleContact, ObstacleInfluence
 from napf_mpc.constraints.constraint import ConstraintError, Horizon, LinearRows
 from napf_mpc.constraints.limits import AltitudeBand, TiltLimit
+from napf_mpc.constraints.neighbours import NeighbourSeparation
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import sphere_sigmas
-from napf_mpc.planners.mpc import QpPlanner, default_constraints
+from napf_mpc.planners.mpc import CONTACT_PRICE, FAST_CONTACT_PRICE, QpPlanner, default_constraints
 from napf_mpc.planners.plan import standing_plan
 from napf_mpc.planners.planner import Command, Reason
 from napf_mpc.planners.registry import make_planner
@@ -166,10 +167,35 @@ def test_the_repulsion_never_outbids_the_margin_it_is_for() -> None:
     rows = influence.rows(horizon)
     assert rows.w2 is not None
     pull = (rows.w2 * rows.violation(horizon.position)).max(axis=(0, 2, 3))
-    assert pull[at] == pytest.approx(0.5 * planner.problem.planner.contact_price)
+    assert pull[at] == pytest.approx(0.5 * CONTACT_PRICE)
     free = replace(influence, most=np.inf).rows(horizon)
     assert free.w2 is not None
     assert (free.w2 * free.violation(horizon.position)).max() > 10.0 * pull[at]
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "asked", "price", "tilt"),
+    [
+        (2.0, {}, CONTACT_PRICE, False),
+        (4.0, {}, CONTACT_PRICE, False),
+        (4.5, {}, FAST_CONTACT_PRICE, True),
+        (2.0, {"contact_price": 70.0, "tilt_thrust": True}, 70.0, True),
+        (6.0, {"contact_price": 70.0, "tilt_thrust": False}, 70.0, False),
+    ],
+)
+def test_fast_formations_have_firmer_margins_and_thrust_for_tilt_unless_asked_otherwise(
+    speed_mps: float, asked: dict[str, Any], price: float, tilt: bool
+) -> None:
+    mission = {"kind": "formation", "length_m": 80.0, "speed_mps": speed_mps}
+    planner = QpPlanner(problem(mission=mission, planner={"kind": "qp"} | asked), guided=False)
+    planner.reset(ObstacleSet.empty(), 1)
+    contact, apart = (
+        next(each for each in planner.constraints if isinstance(each, kind))
+        for kind in (ObstacleContact, NeighbourSeparation)
+    )
+    assert contact.w1 == apart.w1 == price
+    command = planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
+    assert command.tilt_thrust == tilt
 
 
 def test_a_sigma_of_tens_of_metres_makes_no_lunge() -> None:
