@@ -81,9 +81,10 @@ THRUST_WEIGHT, TORQUE_WEIGHT = 60.0, 600.0
 """``planner.thrust_weight`` and ``planner.torque_weight`` of the paper's vehicle, in their units."""
 FAST_MPS = GuidanceSettings.usual_mps
 """Formation speed beyond which prices, thrust and, see there, guidance are others."""
-CONTACT_PRICE, FAST_CONTACT_PRICE = 300.0, 3000.0
-"""``planner.contact_price`` up to and beyond that. The slot of a UAV that waits at a corner runs away by ten
-metres in the seconds of a horizon, all of which pull at the few stages on which the corner is cut."""
+CONTACT_PRICE, FAST_CONTACT_PRICE, FAST_RAW_CONTACT_PRICE = 300.0, 3000.0, 1000.0
+"""``planner.contact_price`` up to that, and beyond it behind a filter and on raw measurements. The slot of a
+UAV that waits at a corner runs away by ten metres in the seconds of a horizon, all of which pull at the few
+stages on which the corner is cut. A margin that jumps with raw measurements would upset who pays as much."""
 SPEED_PRICE = (1000.0, 1000.0)
 """Prices of a speed slack: above what the margins can gain by it, so that no margin buys a dash."""
 _CAUSES = np.array([reason.name.lower() for reason in Refusal], dtype=object)
@@ -142,7 +143,9 @@ def contact_price(problem: Problem) -> float:
     asked = problem.planner.contact_price
     if asked is not None:
         return asked
-    return FAST_CONTACT_PRICE if _is_fast(problem) else CONTACT_PRICE
+    if not _is_fast(problem):
+        return CONTACT_PRICE
+    return FAST_RAW_CONTACT_PRICE if problem.navigation.filter == "none" else FAST_CONTACT_PRICE
 
 
 def _is_fast(problem: Problem) -> bool:

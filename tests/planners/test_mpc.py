@@ -19,7 +19,14 @@ from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.navigation.solution import NavSolution
 from napf_mpc.planners.guide import Guide, Passage
 from napf_mpc.planners.guide_clearance import sphere_sigmas
-from napf_mpc.planners.mpc import CONTACT_PRICE, FAST_CONTACT_PRICE, QpPlanner, default_constraints
+from napf_mpc.planners.mpc import (
+    CONTACT_PRICE,
+    FAST_CONTACT_PRICE,
+    FAST_RAW_CONTACT_PRICE,
+    QpPlanner,
+    contact_price,
+    default_constraints,
+)
 from napf_mpc.planners.plan import standing_plan
 from napf_mpc.planners.planner import Command, Reason
 from napf_mpc.planners.registry import make_planner
@@ -178,7 +185,7 @@ def test_the_repulsion_never_outbids_the_margin_it_is_for() -> None:
     [
         (2.0, {}, CONTACT_PRICE, False),
         (4.0, {}, CONTACT_PRICE, False),
-        (4.5, {}, FAST_CONTACT_PRICE, True),
+        (4.5, {}, FAST_RAW_CONTACT_PRICE, True),
         (2.0, {"contact_price": 70.0, "tilt_thrust": True}, 70.0, True),
         (6.0, {"contact_price": 70.0, "tilt_thrust": False}, 70.0, False),
     ],
@@ -196,6 +203,8 @@ def test_fast_formations_have_firmer_margins_and_thrust_for_tilt_unless_asked_ot
     assert contact.w1 == apart.w1 == price
     command = planner.step(nav(on_slots(planner), cruising(planner)), 0.0)
     assert command.tilt_thrust == tilt
+    filtered = problem(mission=mission, planner={"kind": "qp"} | asked, navigation={"filter": "kalman"})
+    assert contact_price(filtered) == (FAST_CONTACT_PRICE if price == FAST_RAW_CONTACT_PRICE else price)
 
 
 def test_a_sigma_of_tens_of_metres_makes_no_lunge() -> None:
