@@ -10,11 +10,11 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from napf_mpc.constraints.clearance import influence_model
-from napf_mpc.planners import registry
+from napf_mpc.planners import mpc, registry
 from napf_mpc.planners.mpc import default_constraints
 from napf_mpc.planners.plan import stage_grid
 from napf_mpc.planners.tally import COLUMNS
-from napf_mpc.problem import Planner
+from napf_mpc.problem import Planner, Vehicle
 from napf_mpc.problem_file import load_problem
 from napf_mpc.solvers import batch, solver
 
@@ -101,6 +101,14 @@ def test_keys_and_defaults_of_the_qp_page_are_those_of_the_planner() -> None:
     assert len(quoted) >= 10
     for key, value in quoted:
         assert getattr(settings, key) == float(value), key
+    assert f"| `planner.thrust_weight` | as {mpc.THRUST_WEIGHT:g} at {Vehicle().mass_kg:g} kg |" in QP_PAGE
+    assert f"| `planner.torque_weight` | as {mpc.TORQUE_WEIGHT:g} at" in QP_PAGE
+    words = " ".join(QP_PAGE.split())
+    assert (
+        f"`planner.contact_price` is {mpc.CONTACT_PRICE:g} /(m s) for formations up to {mpc.FAST_MPS:g} m/s"
+        in words
+    )
+    assert f"{mpc.FAST_CONTACT_PRICE:g} behind a filter and {mpc.FAST_RAW_CONTACT_PRICE:g} on raw" in words
     assert f"`planner.cohesion_room_m` from the lane,\nby default {settings.room_m:g} m" in QP_PAGE
 
 
