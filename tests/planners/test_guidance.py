@@ -15,7 +15,7 @@ from napf_mpc.errors import ProblemError
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guidance import Guidance, _largest_sigma, _measure, _note
 from napf_mpc.planners.guide import Guide, Passage
-from napf_mpc.planners.guide_band import Band, solve_band
+from napf_mpc.planners.guide_band import Band, solve_band, way_across
 from napf_mpc.planners.guide_settings import GuidanceSettings
 from napf_mpc.planners.guided_field import STRICT, GuidedNapfPlanner
 from napf_mpc.planners.registry import make_planner
@@ -228,6 +228,26 @@ def test_a_tower_wider_than_the_usual_detour_is_gone_round(width_m: float, passe
     assert clearance(made, places) > K_SIGMA - SETTINGS.squeeze_m
     if passed:
         assert np.abs(places[-1][:, 1:] - SLOTS[:, 1:]).max() < 3.0
+
+
+@pytest.mark.parametrize("width_m", [30.0, 40.0, 48.0])
+def test_a_deep_block_is_gone_round_at_its_margin_without_a_hold(width_m: float) -> None:
+    """Its corners push firmly: ways that cut them lacked up to a metre and more, and were held before."""
+    made = guidance([Box((80.0, 0.0, 0.0), (40.0, width_m, ENDLESS))])
+    places, guides = follow(made, until_m=140.0)
+    assert places[-1][:, 0].min() >= 140.0
+    assert Passage.HOLD not in reasons(guides)
+    assert clearance(made, places) > 1.2
+    assert max(guide.breach_m.max() for guide in guides) < 0.1
+
+
+def test_the_way_across_makes_up_for_what_a_corner_lacks() -> None:
+    """Corner at the origin, places behind it and beside: exactly the distance that is kept, and no more."""
+    for along, left in ((1.0, 0.8), (2.0, 0.9), (0.0, 1.0), (1.9, 1.2)):
+        distance = math.hypot(along, left)
+        moved = left + way_across(2.3 - distance, distance, left / distance)
+        assert math.hypot(along, moved) == pytest.approx(2.3)
+    assert way_across(1.5, -0.5, 0.5) == pytest.approx(3.0)  # inside nothing better is known
 
 
 def test_a_row_of_small_things_takes_no_wide_detour() -> None:
