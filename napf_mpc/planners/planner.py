@@ -63,14 +63,14 @@ class Command:
     """Plans over time: the inner loop then flies ``u_plan(t) - K (x_nav - x_plan(t))``."""
     planned: NDArray[np.bool_] | None = None
     """(run, uav): whose plan is to be flown; the others follow path point, velocity and direction."""
-    tilt_thrust: bool = False
-    """Whether a plan's thrust is what holds against gravity, to be given in full at any tilt."""
     reason: NDArray[np.int8] | None = None
     """(run, uav) codes of :class:`Reason`: why a UAV does not fly on as asked."""
     slack_m: Array | None = None
     """(run, uav) most that the flown plan is inside an obstacle's margin [m]."""
     solver_status: NDArray[np.str_] | None = None
     """(run, uav) word of the solver for this step's program."""
+    tilt_thrust: bool = False
+    """Whether a plan's thrust is what holds against gravity, to be given in full at any tilt."""
 
 
 _FIELDS = (
