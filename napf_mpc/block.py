@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,8 +15,9 @@ from napf_mpc.closed_loop import Scenario, build_scenario, closed_loop
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import METRICS, MissionScore, Outcome, Score
 from napf_mpc.navigation.monitor import DoubtEvent, MonitorEvent
+from napf_mpc.own_parts import OwnParts
 from napf_mpc.planners.planner import Planner, planner_fault, tally_of
-from napf_mpc.planners.registry import NAME_IT, Factory, make_planner
+from napf_mpc.planners.registry import NAME_IT, make_planner
 from napf_mpc.planners.tally import Event, Tally
 from napf_mpc.problem import Problem
 from napf_mpc.record import TrajectoryRecorder
@@ -119,7 +120,7 @@ def fly_block(
     runs: range,
     data_folder: Path | None = None,
     record_every: int = 0,
-    own: Mapping[str, Factory] | None = None,
+    own: OwnParts | None = None,
 ) -> Block:
     """Fly some runs of a campaign with every planner, on the same scenes and errors.
 
@@ -137,9 +138,8 @@ def fly_block(
         Where data files lie.
     record_every : int
         Keep every n-th tick of the trajectories; 0 for none.
-    own : mapping of str to callable, optional
-        Registered planners, where they are not this process's; see
-        :func:`napf_mpc.planners.registry.make_planner`.
+    own : OwnParts, optional
+        Planners and a solver that were registered in another process.
 
     Returns
     -------
@@ -151,13 +151,21 @@ def fly_block(
     NapfError
         If the problem cannot be flown or data are missing.
     """
+    if own is not None:
+        own.lend()
     # More threads than one would make workers fight for the cores, and win nothing on small matrices.
     with threadpool_limits(1):
         scenario = build_scenario(problem, seed, runs, data_folder)
         rows, timing, trajectories, events = [], [], [], []
         for name in planners:
             began = time.perf_counter()
-            flown = _fly(problem, name, make_planner(name, problem, own), scenario, record_every)
+            flown = _fly(
+                problem,
+                name,
+                make_planner(name, problem, None if own is None else own.planners),
+                scenario,
+                record_every,
+            )
             timing.append(timing_row(name, runs, time.perf_counter() - began))
             rows.append(score_rows(name, seed, flown.score, flown.tally))
             events.append(flown.tally.event_columns(name, runs.start))

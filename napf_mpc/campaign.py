@@ -19,7 +19,8 @@ from napf_mpc.closed_loop import Scenario, build_scenario
 from napf_mpc.cluster import connected
 from napf_mpc.errors import ProblemError
 from napf_mpc.evaluate import Outcome
-from napf_mpc.planners.registry import make_planner, own_planners
+from napf_mpc.own_parts import OwnParts
+from napf_mpc.planners.registry import make_planner
 from napf_mpc.prefix import Prefix
 from napf_mpc.problem import Problem
 from napf_mpc.provenance import identity, versions
@@ -128,7 +129,7 @@ def run_campaign(
     name : str
         Problem's name in the summary.
     workers : int
-        Processes; they are sent the planners of :func:`~napf_mpc.planners.registry.register_planner`.
+        Processes; they are sent planners and a solver that were registered in this one.
     block_runs : int, optional
         Runs flown in lock-step; changes no result.
     data_folder : Path, optional
@@ -168,7 +169,7 @@ def run_campaign(
         raise ProblemError("campaign", [f"block-limit = {shown_value(block_limit_s)}: must be > 0 seconds"])
     scenario = check_flyable(problem, planners, seed, data_folder)
     origin = identity(problem, name, planners, seed, data_folder) | {"record_every": record_every}
-    own = own_planners(planners)
+    own = OwnParts.of(problem, planners)
     fly = partial(
         fly_block, problem, tuple(planners), seed, data_folder=data_folder, record_every=record_every, own=own
     )

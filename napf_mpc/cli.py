@@ -47,6 +47,14 @@ Settings = Annotated[
 Data = Annotated[
     Path | None, typer.Option(help="Folder with data files (default: variable NAPF_MPC_DATA, else data/).")
 ]
+With = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--with",
+        metavar="MODULE",
+        help="Python file or module that registers planners or solvers of your own. Repeatable.",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Print errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON on standard output.")]
 Runs = Annotated[int, typer.Option(help="Number of runs.")]
@@ -145,10 +153,19 @@ def _complain(text: str) -> None:
         print(f"error: {line}", file=sys.stderr)
 
 
-def _problem(file: str, settings: list[str] | None) -> Problem:
+def _problem(file: str, settings: list[str] | None, own: list[str] | None = None) -> Problem:
     from napf_mpc.problem_file import load_problem
 
+    _load(own)
     return load_problem(file, settings or ())
+
+
+def _load(own: list[str] | None) -> None:
+    if own:
+        from napf_mpc.extensions import load_extension
+
+        for where in own:
+            load_extension(where)
 
 
 def _name(file: str) -> str:
@@ -207,10 +224,15 @@ def problems(
 
 @app.command()
 def validate(
-    file: File, settings: Settings = None, data: Data = None, quiet: Quiet = False, as_json: Json = False
+    file: File,
+    settings: Settings = None,
+    own: With = None,
+    data: Data = None,
+    quiet: Quiet = False,
+    as_json: Json = False,
 ) -> None:
     """Check a problem file: every error with key, value and what is allowed."""
-    problem = _problem(file, settings)
+    problem = _problem(file, settings, own)
     from napf_mpc.mission import check_mission
 
     missing = check_mission(problem, data)
@@ -232,12 +254,13 @@ def run(
     out: Out = None,
     animation: Animation = False,
     settings: Settings = None,
+    own: With = None,
     data: Data = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Fly one mission: metrics, and with --out trajectories and figures. Exit code 1 if it is not reached."""
-    problem, name = _problem(file, settings), _name(file)
+    problem, name = _problem(file, settings, own), _name(file)
     kind = problem.planner.kind if planner is None else planner
     from napf_mpc.mission import fly_mission
 
@@ -265,6 +288,7 @@ def compare(
     block_limit: BlockLimit = None,
     out: Out = None,
     settings: Settings = None,
+    own: With = None,
     data: Data = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -272,7 +296,7 @@ def compare(
     """Fly planners on the same seeds and compare them: the paper's Table 1 for any problem."""
     names = _names(planners)
     engine = _engine(workers, cluster, block_limit)
-    _campaign(_problem(file, settings), file, names, runs, seed, engine, out, data, quiet, as_json)
+    _campaign(_problem(file, settings, own), file, names, runs, seed, engine, out, data, quiet, as_json)
 
 
 @app.command()
@@ -297,12 +321,13 @@ def montecarlo(
         bool, typer.Option("--trajectories", help="Keep trajectories at the planner's rate.")
     ] = False,
     settings: Settings = None,
+    own: With = None,
     data: Data = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Fly many missions of one planner; repeat the command to go on where it stopped."""
-    problem = _problem(file, settings)
+    problem = _problem(file, settings, own)
     ticks = round(problem.simulation.controller_rate_hz / problem.planner.rate_hz) if trajectories else 0
     names = [problem.planner.kind if planner is None else planner]
     engine = _engine(workers, cluster, block_limit)
@@ -329,6 +354,7 @@ def sweep(
     seed: Seed = 0,
     workers: Workers = None,
     settings: Settings = None,
+    own: With = None,
     data: Data = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -336,6 +362,7 @@ def sweep(
     """Fly a grid over problem keys: one table, one figure; repeat the command to go on where it stopped."""
     from napf_mpc.sweep import grid_points, run_sweep
 
+    _load(own)
     points = grid_points(file, vary, settings or ())
     names = _names(points[0].problem.planner.kind if planners is None else planners)
     total = len(points) * runs
@@ -374,12 +401,13 @@ def rare(
     ] = 1000,
     seed: Seed = 0,
     settings: Settings = None,
+    own: With = None,
     data: Data = None,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Estimate a collision risk too small to count, by subset simulation; repeat the command to go on."""
-    problem = _problem(file, settings)
+    problem = _problem(file, settings, own)
     from napf_mpc.rare_events.estimate import check_samples, estimate_collision_risk
 
     check_samples(samples)
@@ -405,6 +433,7 @@ def figures(
     seed: Seed = 0,
     animation: Animation = False,
     settings: Settings = None,
+    own: With = None,
     data: Data = None,
     quiet: Quiet = False,
     as_json: Json = False,
@@ -417,7 +446,7 @@ def figures(
 
         paths = draw_stored(Path(source), out, data, animation)
     else:
-        problem = _problem(source, settings)
+        problem = _problem(source, settings, own)
         from napf_mpc.figures import draw_problem
 
         paths = draw_problem(problem, _name(source), seed, out, data)
@@ -458,13 +487,16 @@ def benchmark_solvers(
     missions: Missions = 8,
     every: Every = 20,
     seed: Seed = 0,
+    own: With = None,
     quiet: Quiet = False,
 ) -> None:
     """Time solvers on programs of missions, and check their claims."""
+    from napf_mpc.benchmark import contenders as known
     from napf_mpc.benchmark import run
-    from napf_mpc.benchmark.contenders import CONTENDERS, SCENES
 
-    chosen_scenes, chosen = _chosen("scenes", scenes, SCENES), _chosen("solvers", contenders, CONTENDERS)
+    _load(own)
+    chosen_scenes = _chosen("scenes", scenes, known.SCENES)
+    chosen = _chosen("solvers", contenders, known.contenders())
     say = partial(_say, quiet=quiet)
     _measured(run.benchmark_solvers(chosen_scenes, chosen, missions, every, seed, out, say), quiet)
 
@@ -491,14 +523,16 @@ def benchmark_planners(
     ] = None,
     missions: Missions = 16,
     seed: Seed = 0,
+    own: With = None,
     quiet: Quiet = False,
 ) -> None:
     """Time control steps and missions of planners."""
     from napf_mpc.benchmark import run
     from napf_mpc.benchmark.contenders import SCENES
-    from napf_mpc.benchmark.planners import PILOTS
+    from napf_mpc.benchmark.planners import pilots as known_pilots
 
-    chosen_scenes, chosen = _chosen("scenes", scenes, SCENES), _chosen("planners", pilots, PILOTS)
+    _load(own)
+    chosen_scenes, chosen = _chosen("scenes", scenes, SCENES), _chosen("planners", pilots, known_pilots())
     say = partial(_say, quiet=quiet)
     _measured(run.benchmark_planners(chosen_scenes, chosen, missions, seed, out, say), quiet)
 

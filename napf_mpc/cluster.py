@@ -8,7 +8,7 @@ import logging
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import replace
 from functools import partial
@@ -16,16 +16,18 @@ from pathlib import Path
 from typing import Any
 
 from napf_mpc.errors import NapfError
-from napf_mpc.planners.registry import Factory
+from napf_mpc.own_parts import OwnParts
 from napf_mpc.problem import Problem
-from napf_mpc.provenance import differences, identity, source_digest
+from napf_mpc.provenance import differences, identity
 from napf_mpc.words import shown_text
-from napf_mpc.workers import DIED, Lost, guarded
+from napf_mpc.workers import DIED, HUNG, Lost, guarded
 
 CONNECT_S = 8.0
 """Time [s] in which a scheduler must answer, and in which its first worker must be there."""
 ALONE_S = 120.0
 """Time [s] after which a scheduler that has lost all workers is given up."""
+FETCH_S = 60.0
+"""Time [s] in which a worker must hand over what came of a block: it may hang after that, too."""
 _KEPT = "finished blocks are kept: repeat the command to go on"
 
 
@@ -91,6 +93,8 @@ class Cluster:
     def result(self, future: Future[Any]) -> Any:
         """What came of a block; the scheduler has tried several workers before it says that they died.
 
+        A worker that does not hand it over in :data:`FETCH_S` is started anew.
+
         Raises
         ------
         NapfError
@@ -99,7 +103,12 @@ class Cluster:
         from distributed import KilledWorker
 
         try:
-            return self._held[future].result()
+            return self._held[future].result(timeout=FETCH_S)
+        except TimeoutError:
+            with contextlib.suppress(Exception):
+                held = self._held[future]
+                self._start_anew(held, self._client.who_has([held])[held.key])
+            return HUNG
         except KilledWorker:
             return replace(DIED, retried=True)
         except CancelledError as error:
@@ -117,8 +126,12 @@ class Cluster:
             return
         with contextlib.suppress(Exception):
             where = [worker for worker, keys in self._client.processing().items() if held.key in keys]
-            held.cancel(force=True)
-            self._client.restart_workers(where, timeout=CONNECT_S, raise_for_error=False)
+            self._start_anew(held, where)
+
+    def _start_anew(self, held: Any, workers: Sequence[str]) -> None:
+        """Take a block back and start its workers anew, those that have a nanny."""
+        held.cancel(force=True)
+        self._client.restart_workers(list(workers), timeout=CONNECT_S, raise_for_error=False)
 
     def close(self) -> None:
         """Take back what is not finished; a block that a worker has begun is ended there and thrown away."""
@@ -136,7 +149,7 @@ def connected(
     origin: Mapping[str, Any],
     problem: Problem,
     data_folder: Path | None = None,
-    own: Mapping[str, Factory] | None = None,
+    own: OwnParts | None = None,
 ) -> Iterator[Cluster]:
     """Connect to a scheduler whose workers are all like this process.
 
@@ -150,8 +163,8 @@ def connected(
         What is flown.
     data_folder : Path, optional
         Where data files lie, on every worker; None for each worker's own.
-    own : mapping of str to callable, optional
-        Registered planners among those that fly.
+    own : OwnParts, optional
+        Registered planners and solver among those that fly.
 
     Raises
     ------
@@ -165,11 +178,11 @@ def connected(
     except ImportError as error:
         raise NapfError(f"{name}: needs the package distributed: pip install 'napf-mpc[cluster]'") from error
     folder = None if data_folder is None else Path(data_folder).resolve()
-    agree = partial(differing, dict(origin), problem, folder, dict(own or {}))
+    agree = partial(differing, dict(origin), problem, folder, own)
     with _quiet(), contextlib.ExitStack() as stack:
         client = _client(Client, address, name)
         stack.callback(_leave, client)
-        hint = "; modules of planners of your own must be installed there, too" if own else ""
+        hint = "; modules of planners and solvers of your own must be installed there, too" if own else ""
         _check_workers(client, name, agree, hint)
         cluster = Cluster(client, name, agree)
         stack.callback(cluster.close)
@@ -231,7 +244,7 @@ def differing(
     origin: Mapping[str, Any],
     problem: Problem,
     data_folder: Path | None,
-    own: Mapping[str, Factory] | None = None,
+    own: OwnParts | None = None,
 ) -> list[str]:
     """Lines on what of a campaign's origin is different in this process: versions, code, data files.
 
@@ -241,10 +254,10 @@ def differing(
         If a data file is missing here.
     """
     ours = identity(problem, origin["problem"], origin["planners"], origin["seed"], data_folder)
-    # A planner that travels whole has no source to be read here.
-    sources = {name: source_digest(factory) for name, factory in (own or {}).items()}
-    read = {name: digest for name, digest in sources.items() if digest != "unknown"}
-    ours["own_planners"] = origin.get("own_planners", {}) | read
+    for key, sources in ({} if own is None else own.digests()).items():
+        # What travels whole has no source to be read here.
+        read = {name: digest for name, digest in sources.items() if digest != "unknown"}
+        ours[key] = origin.get(key, {}) | read
     compared = {key: origin.get(key, {}) for key in ours}
     return differences(json.loads(json.dumps(ours)), json.loads(json.dumps(compared)))
 

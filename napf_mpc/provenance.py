@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import platform
-import sys
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import metadata
@@ -52,20 +50,6 @@ def _code_digest() -> str:
     return digest.hexdigest()
 
 
-def source_digest(factory: object) -> str:
-    """Digest of the source of a registered planner, ``unknown`` if there is none to read.
-
-    Of the whole module that defines it; of a script or a notebook only its own lines, since the rest of those
-    says what to fly. What the module imports does not count.
-    """
-    whole = getattr(factory, "__module__", None) != "__main__"
-    try:
-        source = inspect.getsource(sys.modules[factory.__module__] if whole else factory)  # type: ignore[arg-type]
-    except (AttributeError, KeyError, TypeError, OSError):
-        return "unknown"
-    return hashlib.sha256(source.encode()).hexdigest()[:16]
-
-
 def data_files(problem: Problem) -> list[str]:
     """Data files that a problem names, as paths under the data folder."""
     named: list[str | None] = []
@@ -105,7 +89,8 @@ def identity(
     name : str
         What it is called; for the reader, it decides nothing.
     planners : sequence of str
-        Names of planners; of registered ones the source's digest is part of the identity.
+        Names of planners; of registered ones, and of a registered solver, the source's digest is part of the
+        identity.
     seed : int
         Campaign seed.
     data_folder : Path, optional
@@ -116,16 +101,15 @@ def identity(
     DataError
         If a data file is missing.
     """
-    from napf_mpc.planners.registry import own_planners  # only here: planners cost start-up time
+    from napf_mpc.own_parts import OwnParts  # only here: planners cost start-up time
 
-    own = {planner: source_digest(factory) for planner, factory in own_planners(planners).items()}
     return {
         "problem": name,
         "problem_hash": problem.digest(),
         "data": data_digests(problem, data_folder),
         "seed": int(seed),
         "planners": list(planners),
-        **({"own_planners": own} if own else {}),
+        **OwnParts.of(problem, planners).digests(),
         "versions": versions(),
     }
 

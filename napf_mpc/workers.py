@@ -302,8 +302,8 @@ class _Processes:
 def _not_given(cause: BaseException) -> NapfError:
     reason = shown_text(str(cause).strip().strip('"').strip().splitlines()[-1], 200)
     return NapfError(
-        f"a worker cannot be given its task: {reason}; define planners of your own in a module that workers "
-        "find (PYTHONPATH, or an installed package), or fly with --workers 1"
+        f"a worker cannot be given its task: {reason}; define planners and solvers of your own in a module "
+        "that workers find (PYTHONPATH, or an installed package), or fly with --workers 1"
     )
 
 

@@ -25,6 +25,7 @@ FLOORS: list[set[str]] = [
     {"goal_walk"},
     {"block"},
     {"summary", "record", "provenance"},
+    {"own_parts"},
     {"evaluate", "lanes"},
     {"closed_loop"},
     {"planners"},
@@ -41,7 +42,7 @@ FLOORS: list[set[str]] = [
     {"problem_file"},
     {"problem_faults"},
     {"problem"},
-    {"store", "data_folder", "data_file", "overrides", "stopping"},
+    {"store", "data_folder", "data_file", "overrides", "stopping", "extensions"},
     {"risk", "first_passage", "shipped", "interrupts", "streams", "jit", "errors", "words"},
 ]
 

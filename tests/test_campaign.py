@@ -7,6 +7,7 @@ import sys
 import threading
 import types
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,23 @@ from napf_mpc.campaign import block_size, check_flyable, chunks, compare, run_ca
 from napf_mpc.errors import DataError, NapfError, OutputError, ProblemError, SceneError
 from napf_mpc.evaluate import METRICS, Outcome
 from napf_mpc.mission import fly_mission
+from napf_mpc.own_parts import source_digest
 from napf_mpc.planners import registry
 from napf_mpc.planners.potential_field import ApfPlanner, NapfPlanner
 from napf_mpc.planners.registry import Factory, register_planner
 from napf_mpc.prefix import Prefix, looks
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
+from napf_mpc.quadratic_program import Sparsity, Values
+from napf_mpc.solvers import batch, solver
+from napf_mpc.solvers.batch import (
+    BatchSolver,
+    OwnSolver,
+    make_batch_solver,
+    own_solver,
+    register_batch_solver,
+)
+from napf_mpc.solvers.solver import Answer, MakeBackend, SolverError, Warm, backend_maker, register_solver
 from napf_mpc.sweep import Point, run_sweep
 
 BRIEF: dict[str, Any] = {
@@ -678,9 +690,70 @@ def test_the_source_of_ones_own_planner_belongs_to_the_origin(
     with pytest.raises(OutputError, match=r"own_planners\.mine = "):
         fly(tmp_path, 2, planners=["mine"])
     typed = eval("lambda problem: None", {"__name__": "__main__"})
-    assert provenance.source_digest(typed) == "unknown"
+    assert source_digest(typed) == "unknown"
     fly(tmp_path / "shipped", 1, planners=["apf"])
     assert "own_planners" not in store.read_json(tmp_path / "shipped" / "campaign.json")
+
+
+class Backwards:
+    """OSQP, for whoever imports this module."""
+
+    def __init__(self, sparsity: Sparsity) -> None:
+        self._osqp = backend_maker("osqp")(sparsity)
+
+    def solve(self, values: Values, warm: Warm | None) -> Answer:
+        return self._osqp.solve(values, warm)
+
+
+def of_horizons(**settings: Any) -> BatchSolver:
+    return make_batch_solver("osqp", **settings)
+
+
+def plain(**settings: Any) -> MakeBackend:
+    return Backwards
+
+
+@pytest.fixture
+def _own_solvers(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, name in ((solver, "_FACTORIES"), (batch, "_BATCH_FACTORIES")):
+        monkeypatch.setattr(module, name, dict(getattr(module, name)))
+    monkeypatch.setattr(solver, "_NAMES", set(solver._NAMES))
+    register_solver("plain", plain)
+    register_solver("inside", lambda **settings: lambda sparsity: Backwards(sparsity))
+    register_batch_solver("of_horizons", of_horizons)
+
+
+@pytest.mark.usefixtures("_own_solvers")
+@pytest.mark.parametrize("name", ["plain", "inside", "of_horizons"])
+def test_a_solver_of_ones_own_flies_in_any_process_and_belongs_to_the_origin(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def problem(name: str) -> Problem:
+        return brief(**{"planner.solver": name, "planner.horizon": 4})
+
+    here = fly(tmp_path / "here", 4, problem=problem("osqp"), planners=["qp"])
+    out = tmp_path / "there"
+    assert fly(out, 4, problem=problem(name), planners=["qp"], workers=2, block_runs=2) == here
+    held = store.read_json(out / "campaign.json")
+    own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16]
+    assert held["own_solver"] == {name: own}
+    assert "own_solver" not in store.read_json(tmp_path / "here" / "campaign.json")
+    # The same name, another source: these results are not mixed with those.
+    if name != "of_horizons":
+        monkeypatch.setitem(solver._FACTORIES, name, partial(backend_maker, "osqp"))
+        with pytest.raises(OutputError, match=rf"own_solver\.{name} = "):
+            fly(out, 6, problem=problem(name), planners=["qp"])
+
+
+@pytest.mark.usefixtures("_own_solvers")
+def test_a_lent_solver_takes_the_place_of_one_of_its_name() -> None:
+    """A worker of a cluster lives longer than a campaign: the next one may bring another kind."""
+    OwnSolver("plain", of_horizons, of_horizons=True).lend()
+    assert own_solver("plain") == OwnSolver("plain", of_horizons, of_horizons=True)
+    OwnSolver("plain", plain, of_horizons=False).lend()
+    assert own_solver("plain") == OwnSolver("plain", plain, of_horizons=False)
+    with pytest.raises(SolverError, match="exists already"):
+        register_solver("plain", plain)
 
 
 def locked() -> Factory:

@@ -12,6 +12,7 @@ import threading
 import time
 import types
 from collections.abc import Iterator
+from concurrent.futures import wait
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,13 @@ from napf_mpc.campaign import run_campaign
 from napf_mpc.cli import run_command
 from napf_mpc.cluster import connected, differing
 from napf_mpc.errors import NapfError
+from napf_mpc.own_parts import OwnParts
 from napf_mpc.planners import registry
 from napf_mpc.planners.potential_field import ApfPlanner
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.provenance import identity
-from napf_mpc.workers import Lost, in_pool
+from napf_mpc.workers import HUNG, Lost, in_pool
 
 NEEDED = "needs the extra: pip install 'napf-mpc[cluster]'"
 distributed = pytest.importorskip("distributed", reason=NEEDED)
@@ -114,7 +116,9 @@ def test_a_planner_that_the_workers_cannot_have_is_named(
     module.Mine = type("Mine", (ApfPlanner,), {"__module__": module.__name__})
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setattr(registry, "_OWN", {"mine": module.Mine})
-    told = r"worker tcp://\S+ cannot load .*nowhere_to_be_found.*; modules of planners of your own must"
+    told = (
+        r"worker tcp://\S+ cannot load .*nowhere_to_be_found.*; modules of planners and solvers of your own"
+    )
     with pytest.raises(NapfError, match=told):
         run_campaign(brief(), ["mine"], 2, 7, tmp_path / "out", cluster=local)
     lock = threading.Lock()
@@ -126,10 +130,11 @@ def test_a_planner_that_the_workers_cannot_have_is_named(
 
 def test_another_source_of_a_planner_is_a_difference() -> None:
     held = origin() | {"planners": ["mine"], "own_planners": {"mine": "0123456789abcdef"}}
-    (line,) = differing(held, brief(), None, {"mine": ApfPlanner})
+    (line,) = differing(held, brief(), None, OwnParts({"mine": ApfPlanner}, None))
     assert re.fullmatch("own_planners.mine = [0-9a-f]{16}, not 0123456789abcdef", line)
     # One that travelled whole has no source to be read there.
-    assert differing(held, brief(), None, {"mine": eval("lambda problem: None", {"__name__": "x"})}) == []
+    whole = OwnParts({"mine": eval("lambda problem: None", {"__name__": "x"})}, None)
+    assert differing(held, brief(), None, whole) == []
 
 
 def die(block: range) -> int:
@@ -302,6 +307,32 @@ def test_a_worker_that_hangs_is_started_anew_and_its_block_flown_again(
         )
         assert len(stopped) == 1
         assert told == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are POSIX")
+def test_a_worker_that_hangs_with_a_finished_block_is_started_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has told the scheduler that it is done, and then hands nothing over."""
+    monkeypatch.setattr(cluster_module, "FETCH_S", 2.0)
+    with (
+        scheduler() as (address, _),
+        worker(address),
+        connected(address, origin(), brief()) as cluster,
+    ):
+        cluster.flying(lambda block: os.getpid())  # it travels whole: workers cannot import tests
+        first, second = cluster.submit(range(1)), cluster.submit(range(1, 2))
+        wait([first, second], timeout=WAIT_S)
+        stopped = cluster.result(first)
+        os.kill(stopped, signal.SIGSTOP)
+        began = time.monotonic()
+        assert cluster.result(second) == HUNG
+        assert time.monotonic() - began < 30.0
+        cluster.release(second, usable=False)
+        while not cluster.slots() and time.monotonic() - began < WAIT_S:
+            time.sleep(0.1)
+        third = cluster.submit(range(2, 3))
+        wait([third], timeout=WAIT_S)
+        assert cluster.result(third) not in (stopped, HUNG)
 
 
 # ---------------------------------------------------------------------------- what is wrong with a cluster

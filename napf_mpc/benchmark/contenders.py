@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from napf_mpc.solvers.batch import BatchSolver, make_batch_solver
+from napf_mpc.solvers.batch import BatchSolver, make_batch_solver, own_solver_names
 from napf_mpc.solvers.solver import SolverError
 
 T = TypeVar("T")
@@ -79,6 +79,12 @@ CONTENDERS: dict[str, Contender] = {
     "cvxpy": Contender("cvxpy", warm=False),
 }
 """Label -> contender. Only OSQP and the kernel make use of a guess."""
+
+
+def contenders() -> dict[str, Contender]:
+    """Label -> contender: solvers that were registered, by their names, behind the shipped ones."""
+    own = {name: Contender(name) for name in own_solver_names()}
+    return CONTENDERS | {name: one for name, one in own.items() if name not in CONTENDERS}
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from napf_mpc.benchmark.contenders import Scene, present
 from napf_mpc.benchmark.steps import StepTime, TimedPlanner, step_times
 from napf_mpc.block import simulate
 from napf_mpc.closed_loop import build_scenario
-from napf_mpc.planners.registry import make_planner
+from napf_mpc.planners.registry import make_planner, own_planners, planner_names
 from napf_mpc.problem import Problem
 from napf_mpc.problem_file import load_problem
 from napf_mpc.solvers.batch import make_batch_solver
@@ -47,6 +47,12 @@ PILOTS: dict[str, Pilot] = {
     "qp_unguided": Pilot("qp_unguided"),
 }
 """Label -> pilot."""
+
+
+def pilots() -> dict[str, Pilot]:
+    """Label -> pilot: planners that were registered, by their names, behind the shipped ones."""
+    own = {name: Pilot(name) for name in own_planners(planner_names())}
+    return PILOTS | {name: one for name, one in own.items() if name not in PILOTS}
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib import import_module
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ from napf_mpc.solvers.solver import (
     SolverError,
     Warm,
     backend_maker,
+    lend_solver,
+    registered_solver,
     solve_safely,
     solver_names,
     take_name,
@@ -340,13 +342,45 @@ _BATCH_FACTORIES: dict[str, Callable[..., BatchSolver]] = {}
 def register_batch_solver(name: str, factory: Callable[..., BatchSolver]) -> None:
     """Add a solver that takes horizons as they are; ``factory(**settings)`` makes one.
 
+    It holds for this process, and travels to workers of a campaign as plain solvers do.
+
     Raises
     ------
     SolverError
-        If the name is taken.
+        If the name is taken or none.
     """
     take_name(name)
     _BATCH_FACTORIES[name] = factory
+
+
+@dataclass(frozen=True)
+class OwnSolver:
+    """A solver that was registered, as another process can be sent it."""
+
+    name: str
+    factory: Callable[..., Any]
+    of_horizons: bool
+    """Whether it takes horizons, or plain programs."""
+
+    def lend(self) -> None:
+        """Make it known to this process, in place of another that was registered by its name."""
+        _BATCH_FACTORIES.pop(self.name, None)
+        lend_solver(self.name, None if self.of_horizons else self.factory)
+        if self.of_horizons:
+            _BATCH_FACTORIES[self.name] = self.factory
+
+
+def own_solver(name: str) -> OwnSolver | None:
+    """Return the registered solver of a name; None if it is a shipped one, or not known."""
+    if name in _BATCH_FACTORIES:
+        return OwnSolver(name, _BATCH_FACTORIES[name], True)
+    factory = registered_solver(name)
+    return None if factory is None else OwnSolver(name, factory, False)
+
+
+def own_solver_names() -> tuple[str, ...]:
+    """Names of the solvers that were registered."""
+    return tuple(name for name in batch_solver_names() if own_solver(name) is not None)
 
 
 def batch_solver_names() -> tuple[str, ...]:

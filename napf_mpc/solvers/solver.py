@@ -24,6 +24,7 @@ from napf_mpc.quadratic_program import (
     Values,
     held,
 )
+from napf_mpc.words import shown_value
 
 Warm = tuple[Array, Array]
 """Guess of z (n,) and y (m,)."""
@@ -91,6 +92,9 @@ _NAMES = {*_SHIPPED, "kernel"}
 def register_solver(name: str, factory: Callable[..., MakeBackend]) -> None:
     """Add a solver of plain programs, for ``planner.solver`` and :func:`make_solver` alike.
 
+    It holds for this process; workers of a campaign are sent the factory, as of a planner, see
+    :func:`napf_mpc.planners.registry.register_planner`.
+
     Parameters
     ----------
     name : str
@@ -102,7 +106,7 @@ def register_solver(name: str, factory: Callable[..., MakeBackend]) -> None:
     Raises
     ------
     SolverError
-        If the name is taken.
+        If the name is taken or none.
     """
     take_name(name)
     _FACTORIES[name] = factory
@@ -114,11 +118,26 @@ def take_name(name: str) -> None:
     Raises
     ------
     SolverError
-        If it is taken.
+        If it is taken, or none.
     """
+    if not isinstance(name, str) or not name or name != name.strip() or not name.isprintable():
+        raise SolverError(f"name = {shown_value(name)}: must be a text without blanks around it")
     if name in _NAMES:
         raise SolverError(f"a solver named {name!r} exists already")
     _NAMES.add(name)
+
+
+def registered_solver(name: str) -> Callable[..., MakeBackend] | None:
+    """Return the factory that was registered by a name, if any."""
+    return _FACTORIES.get(name)
+
+
+def lend_solver(name: str, factory: Callable[..., MakeBackend] | None) -> None:
+    """Know a solver that another process registered, whatever had its name; None only takes the name."""
+    _NAMES.add(name)
+    _FACTORIES.pop(name, None)
+    if factory is not None:
+        _FACTORIES[name] = factory
 
 
 def solver_names() -> tuple[str, ...]:

@@ -428,6 +428,9 @@ def test_unknown_names_missing_extras_and_settings() -> None:
         package = rf"qpsolvers\[{name}\]" if name in ("proxqp", "quadprog") else r"napf-mpc\[solvers\]"
         with pytest.raises(SolverError, match=f"pip install '{package}'"):
             make_solver(name)
+    for none in ("", " osqp", "two\nlines", None):
+        with pytest.raises(SolverError, match="must be a text without blanks around it"):
+            register_solver(none, lambda: lambda sparsity: None)  # type: ignore[arg-type, return-value]
     with pytest.raises(SolverError, match="exists already"):
         register_solver("osqp", lambda: lambda sparsity: None)  # type: ignore[arg-type, return-value]
 
