@@ -46,18 +46,21 @@ def read_ubx(path: Path | str) -> PosTrack:
     path = log_file(path)
     fixes: list[tuple[int, float, list[float], Array]] = []
     reports: dict[int, Array] = {}
+    epoch, last_ms = 0, -1
     for message in _messages(path):
+        # Messages of an epoch stand together. Its time of week alone comes again a week later.
+        if (now_ms := _time_of_week_ms(message)) != last_ms:
+            epoch, last_ms = epoch + 1, now_ms
         if message.identity == "NAV-COV" and message.posCovValid:
-            reports[_time_of_week_ms(message)] = _covariance(message)
+            reports[epoch] = _covariance(message)
         elif message.identity == "NAV-PVT":
             sound = message.fixType in _FIX_3D and message.gnssFixOk and message.validDate
             if sound and not getattr(message, "invalidLlh", 0):
-                week_ms = _time_of_week_ms(message)
                 position = [message.lat, message.lon, 1e-3 * message.height]
                 east = 0.5 * (1e-3 * message.hAcc) ** 2
                 plain = np.diag([east, east, (1e-3 * message.vAcc) ** 2])
-                fixes.append((week_ms, _gps_time(message, week_ms), position, plain))
-    covariances = [reports.get(week_ms, plain) for week_ms, _, _, plain in fixes]
+                fixes.append((epoch, _gps_time(message, now_ms), position, plain))
+    covariances = [reports.get(epoch, plain) for epoch, _, _, plain in fixes]
     return checked_track(
         path, "GPST", [time for _, time, _, _ in fixes], [place for _, _, place, _ in fixes], covariances
     )

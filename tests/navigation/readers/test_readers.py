@@ -148,11 +148,14 @@ def pvt(second: int, place: tuple[float, float, float], **changes: object) -> by
     return bytes(pyubx2.UBXMessage("NAV", "NAV-PVT", pyubx2.GET, **(fields | changes)).serialize())
 
 
-def cov(second: int) -> bytes:
+def cov(second: int, **changes: float) -> bytes:
+    fields = {
+        "posCovNN": 9.0, "posCovNE": 1.0, "posCovND": -2.0, "posCovEE": 16.0, "posCovED": 0.5,
+        "posCovDD": 25.0,
+    } | changes  # fmt: skip
     message = pyubx2.UBXMessage(
-        "NAV", "NAV-COV", pyubx2.GET, iTOW=(SECOND_OF_WEEK + second) * 1000, posCovValid=1, posCovNN=9.0,
-        posCovNE=1.0, posCovND=-2.0, posCovEE=16.0, posCovED=0.5, posCovDD=25.0,
-    )  # fmt: skip
+        "NAV", "NAV-COV", pyubx2.GET, iTOW=(SECOND_OF_WEEK + second) * 1000, posCovValid=1, **fields
+    )
     return bytes(message.serialize())
 
 
@@ -171,6 +174,17 @@ def test_ubx_comes_back_in_metres(tmp_path: Path) -> None:
     np.testing.assert_allclose(track.covariance[0], [[16, 1, -0.5], [1, 9, 2], [-0.5, 2, 25]])
     # Without NAV-COV: 5 m horizontally is 25 m^2 for both axes together.
     np.testing.assert_allclose(track.covariance[1], np.diag([12.5, 12.5, 81.0]))
+
+
+def test_ubx_of_two_weeks_keeps_the_covariances_of_each(tmp_path: Path) -> None:
+    """Drives at the same time of the week in one file: a covariance belongs to the epoch it stands in."""
+    path = tmp_path / "log.ubx"
+    first = b"".join(pvt(s, PLACE) + cov(s, posCovDD=4.0) for s in range(2))
+    week = b"".join(cov(s, posCovDD=100.0) + pvt(s, PLACE, day=18) for s in range(2))
+    path.write_bytes(first + week + pvt(2, PLACE, day=18))
+    track = read_ubx(path)
+    np.testing.assert_allclose(track.time_s - track.time_s[0], [0.0, 1.0, 604_800.0, 604_801.0, 604_802.0])
+    np.testing.assert_allclose(track.covariance[:, 2, 2], [4.0, 4.0, 100.0, 100.0, 81.0])
 
 
 def test_ubx_that_is_none(tmp_path: Path) -> None:
