@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,9 +116,10 @@ def read_error_log_csv(path: Path | str) -> ErrorLog:
     Parameters
     ----------
     path : Path or str
-        Comma-separated with a header line: ``t_s``, ``available`` (0 or 1), ``err_e_m``, ``err_n_m``,
-        ``err_u_m``, ``cov_ee_m2``, ``cov_en_m2``, ``cov_eu_m2``, ``cov_nn_m2``, ``cov_nu_m2``, ``cov_uu_m2``
-        in any order; further columns are left alone. Without a fix the numbers may be empty.
+        Comma-separated, fields quoted or not, with a header line: ``t_s``, ``available`` (0 or 1),
+        ``err_e_m``, ``err_n_m``, ``err_u_m``, ``cov_ee_m2``, ``cov_en_m2``, ``cov_eu_m2``, ``cov_nn_m2``,
+        ``cov_nu_m2``, ``cov_uu_m2`` in any order, each once; further columns are left alone. Without a fix
+        the numbers may be empty.
 
     Raises
     ------
@@ -127,27 +129,41 @@ def read_error_log_csv(path: Path | str) -> ErrorLog:
     path = Path(path)
     lines = numbered_lines(path)
     _, head = next(lines, (0, ""))
-    header = [name.strip() for name in head.split(",")]
+    header = _csv_fields(head)
     wanted = ("t_s", "available", *_CSV_ERRORS, *_CSV_COVARIANCES)
     missing = [name for name in wanted if name not in header]
     if missing:
         raise DataError(
             f"{path}, line 1: column {missing[0]} is missing (has {shown_text(head, 120)}); "
-            f"needed are {', '.join(wanted)}"
+            f"needed are {', '.join(wanted)}, with commas between"
         )
+    if twice := [name for name in wanted if header.count(name) > 1]:
+        count = header.count(twice[0])
+        raise DataError(f"{path}, line 1: column {twice[0]} is there {count} times; keep one")
     places = {name: header.index(name) for name in wanted}
     rows = []
     for number, line in lines:
-        fields = line.split(",")
+        fields = _csv_fields(line)
         if len(fields) != len(header):
             raise DataError(f"{path}, line {number}: {len(fields)} fields, the header has {len(header)}")
-        rows.append(_csv_row(f"{path}, line {number}", [fields[places[name]].strip() for name in wanted]))
+        rows.append(_csv_row(f"{path}, line {number}", [fields[places[name]] for name in wanted]))
         if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
             raise DataError(f"{path}, line {number}: time {rows[-1][0]:g} s is not after the line before")
     table = np.array(rows).reshape(-1, len(wanted))
     ee, en, eu, nn, nu, uu = table[:, 5:].T
     covariance = np.stack([np.stack(row, -1) for row in ((ee, en, eu), (en, nn, nu), (eu, nu, uu))], -2)
     return ErrorLog(str(path), table[:, 0], table[:, 1] == 1.0, table[:, 2:5], covariance)
+
+
+def _csv_fields(line: str) -> list[str]:
+    """Fields of a line, quoted or not; none of a line that is no CSV."""
+    fields = line.split(",")
+    if '"' in line:
+        try:
+            fields = next(csv.reader([line], skipinitialspace=True))
+        except csv.Error:  # a quote that does not end, and what follows is too long for a field
+            return []
+    return [field.strip() for field in fields]
 
 
 def _csv_row(place: str, fields: list[str]) -> list[float]:

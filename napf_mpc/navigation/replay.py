@@ -40,7 +40,7 @@ def load_error_log(config: Recorded, data_folder: Path | None) -> ErrorLog:
     Raises
     ------
     DataError
-        The log is missing or unusable.
+        The log is missing or unusable, or its truth is the solution itself.
     """
     if Path(config.file).suffix.lower() == ".csv" and config.format == "auto":
         if config.truth_file is not None:
@@ -54,7 +54,13 @@ def load_error_log(config: Recorded, data_folder: Path | None) -> ErrorLog:
     truth_kind = format_of(config.truth_file, config.truth_format, "navigation.truth_file")
     solution = read_track(find_data_file(config.file, data_folder), kind)
     truth = read_track(find_data_file(config.truth_file, data_folder), truth_kind)
-    return errors_against_truth(solution, truth)
+    log = errors_against_truth(solution, truth)
+    if not log.error.any():
+        raise DataError(
+            f"navigation.truth_file: {config.truth_file} has the positions of {config.file} to the last "
+            "digit, so that no error is left; name the true ones"
+        )
+    return log
 
 
 def recorded_errors(

@@ -94,7 +94,34 @@ def test_csv_columns_may_stand_in_any_order_and_others_are_left_alone(tmp_path: 
     np.testing.assert_array_equal(a.covariance, b.covariance)
 
 
+def test_csv_fields_may_stand_in_quotes(tmp_path: Path):
+    """As R and many tables write them; a comma inside quotes is no separator."""
+    head = ",".join(f'"{name}"' for name in [*CSV_HEAD.split(","), "where"])
+    rows = [f'{row}, "Nagoya, ""main"" station"' for row in CSV_ROWS]
+    path = tmp_path / "quoted.csv"
+    path.write_text("\n".join([head, *rows]), encoding="utf-8")
+    a, b = read_error_log_csv(path), read_error_log_csv(csv_file(tmp_path, CSV_ROWS))
+    np.testing.assert_array_equal(a.error, b.error)
+    np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
 BAD_CSV = {
+    "column twice": (
+        "\n".join([f"{CSV_HEAD},err_e_m", *(f"{row},7.0" for row in CSV_ROWS)]),
+        "line 1: column err_e_m is there 2 times; keep one",
+    ),
+    "other separator": (
+        "\n".join([CSV_HEAD, *CSV_ROWS]).replace(",", ";"),
+        "column t_s is missing .*with commas between",
+    ),
+    "quote that does not end": (
+        "\n".join([CSV_HEAD, CSV_ROWS[0].replace("-2.0", '"-2.0'), *CSV_ROWS[1:]]),
+        "line 2: 4 fields, the header has",
+    ),
+    "endless quote": (
+        "\n".join([CSV_HEAD, '"' + "1," * 70_000, *CSV_ROWS]),
+        "line 2: 0 fields, the header has",
+    ),
     "empty": ("", "column t_s is missing"),
     "header only": (CSV_HEAD, "0 epochs with a fix"),
     "one fix": ("\n".join([CSV_HEAD, *CSV_ROWS[:2]]), "1 epochs with a fix"),

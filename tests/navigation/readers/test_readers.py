@@ -289,6 +289,16 @@ def test_a_problem_replays_the_errors_between_two_logs(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.covariance[0, 0, 0], 16.0)
 
 
+def test_a_log_is_not_its_own_truth(tmp_path: Path) -> None:
+    """The same positions under both names would fly without any error."""
+    ubx_log(tmp_path / "rover.ubx", 3.0)
+    ubx_log(tmp_path / "copy.ubx", 3.0)
+    for truth in ("rover.ubx", "copy.ubx"):
+        config = Recorded(kind="recorded", file="rover.ubx", truth_file=truth)
+        with pytest.raises(DataError, match=rf"truth_file: {truth} has the positions of rover\.ubx"):
+            load_error_log(config, tmp_path)
+
+
 def test_nmea_after_a_gap_of_days_is_dated_by_its_date(tmp_path: Path) -> None:
     lines = [zda("10:00:00", 11), gga("10:00:00", PLACE), gga("10:00:01", PLACE)]
     lines += [zda("11:00:00", 13), gga("11:00:00", PLACE)]  # two days and an hour later
