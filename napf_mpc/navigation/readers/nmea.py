@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime as dt
 import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +56,9 @@ def read_nmea(path: Path | str) -> PosTrack:
     """
     path = log_file(path)
     clock = _Clock()
-    fixes: list[tuple[float, list[float]]] = []
+    fixes: list[tuple[_Epoch, list[float]]] = []
     separated: set[bool] = set()
-    reports: dict[float, Array] = {}
+    reports: list[tuple[_Epoch, Array]] = []
     for number, line in numbered_lines(path):
         if not line.startswith(("$", "!")):
             raise DataError(f"{path}, line {number}: {shown_text(line)} is no NMEA sentence ($...*hh)")
@@ -71,9 +72,9 @@ def read_nmea(path: Path | str) -> PosTrack:
             continue
         if not isinstance(message.time, dt.time):
             continue  # before its first fix a receiver knows no time
-        time_s = clock.count(message.time)
+        epoch = clock.count(message.time)
         if kind[1] == "GST":
-            reports[time_s] = _covariance(place, message)
+            reports.append((epoch, _covariance(place, message)))
         elif message.quality != 0:
             values = (message.lat, message.lon, message.alt)
             separation = message.sep if message.sep != "" else 0.0
@@ -85,10 +86,11 @@ def read_nmea(path: Path | str) -> PosTrack:
                     f"{place}: some GGA give the geoid's separation and some leave it empty, so that heights "
                     "do not go together"
                 )
-            fixes.append((time_s, [float(values[0]), float(values[1]), float(values[2]) + float(separation)]))
-    times = [clock.offset_s + time_s for time_s, _ in fixes]
+            fixes.append((epoch, [float(values[0]), float(values[1]), float(values[2]) + float(separation)]))
+    times = [clock.offset_s + epoch.time_s for epoch, _ in fixes]
     unknown = np.zeros((3, 3))
-    covariances = [reports.get(time_s, unknown) for time_s, _ in fixes]
+    reported = {epoch.time_s: covariance for epoch, covariance in reports}
+    covariances = [reported.get(epoch.time_s, unknown) for epoch, _ in fixes]
     heights = "geodetic" if separated == {False} else "ellipsoidal"
     return checked_track(path, clock.system, times, [position for _, position in fixes], covariances, heights)
 
@@ -108,25 +110,43 @@ def _parsed(place: str, line: str) -> Any:
         raise DataError(f"{place}: broken sentence ({shown_text(str(error), 120)})") from error
 
 
+@dataclass
+class _Epoch:
+    """Moment that sentences share; which day it is may be learnt from a later one of them."""
+
+    second: float
+    """Of the day."""
+    days: int
+    """Since the first midnight."""
+    dated: bool = False
+    """Whether a date has told the day."""
+
+    @property
+    def time_s(self) -> float:
+        """Time since the first midnight [s]."""
+        return self.days * DAY_S + self.second
+
+
 class _Clock:
     """Turns times of day into seconds that go on over midnight."""
 
     def __init__(self) -> None:
-        self.days = 0
-        self.last_s = -1.0
+        self.now = _Epoch(-1.0, 0)
         self.offset_s = 0.0
         self.system = "UTC, no date"
 
-    def count(self, time: dt.time) -> float:
-        """Seconds since the first midnight; a step back of more than half a day is a new day."""
+    def count(self, time: dt.time) -> _Epoch:
+        """Epoch of a sentence; a step back of more than half a day is a new day."""
         second = time.hour * 3600.0 + time.minute * 60.0 + time.second + 1e-6 * time.microsecond
-        if second < self.last_s - DAY_S / 2:
-            self.days += 1
-        self.last_s = second
-        return self.days * DAY_S + second
+        if second != self.now.second:
+            self.now = _Epoch(second, self.now.days + (second < self.now.second - DAY_S / 2))
+        return self.now
 
     def date(self, message: Any) -> None:
-        """Learn the date of the first midnight, then how many days a gap has taken."""
+        """Learn the date of the first midnight, then how many days a gap has taken.
+
+        Many receivers send the date last in an epoch, so it holds for what the epoch began with, too.
+        """
         if not isinstance(message.time, dt.time):
             return
         if message.msgID == "ZDA":
@@ -137,13 +157,15 @@ class _Clock:
             return
         if not all(isinstance(part, int) for part in day) or day[0] < 1980:
             return
-        self.count(message.time)
+        epoch = self.count(message.time)
         midnight_s = unix_seconds(*day) - GPS_EPOCH_UNIX_S
-        if self.system == "UTC":
-            self.days = round((midnight_s - self.offset_s) / DAY_S)
-            return
-        self.offset_s = midnight_s - self.days * DAY_S
-        self.system = "UTC"
+        if self.system != "UTC":
+            self.offset_s = midnight_s - epoch.days * DAY_S
+            self.system = "UTC"
+        days = round((midnight_s - self.offset_s) / DAY_S)
+        if epoch.dated and epoch.days != days:  # the same second of another day
+            epoch = self.now = _Epoch(epoch.second, days)
+        epoch.days, epoch.dated = days, True
 
 
 def _covariance(place: str, gst: Any) -> Array:

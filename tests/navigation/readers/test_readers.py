@@ -309,6 +309,23 @@ def test_nmea_after_a_gap_of_days_is_dated_by_its_date(tmp_path: Path) -> None:
         read_nmea(written(tmp_path, *back))
 
 
+def test_nmea_the_same_second_of_another_day_leaves_the_first_where_it_was(tmp_path: Path) -> None:
+    lines = [gga("10:00:00", PLACE), zda("10:00:00", 11), zda("10:00:00", 13), gga("10:00:00", PLACE)]
+    track = read_nmea(written(tmp_path, *lines))
+    np.testing.assert_allclose(track.time_s - GPS_DAY_S, [36_000.0, 2 * 86_400.0 + 36_000.0])
+
+
+@pytest.mark.parametrize("clock", ["09:00:00", "10:30:00"])
+def test_nmea_whose_date_comes_last_is_dated_by_it(tmp_path: Path, clock: str) -> None:
+    """Positions first, date last: the first position after a gap of days belongs to the day told after it."""
+    lines = [gga("10:00:00", PLACE), gst("10:00:00", 2.0, 1.0, 0.0, 3.0), zda("10:00:00", 11)]
+    lines += [gga(clock, PLACE), gst(clock, 5.0, 4.0, 0.0, 6.0), zda(clock, 13)]
+    track = read_nmea(written(tmp_path, *lines))
+    hours = int(clock[:2]) + int(clock[3:5]) / 60.0
+    np.testing.assert_allclose(track.time_s - GPS_DAY_S, [36_000.0, 2 * 86_400.0 + 3600.0 * hours])
+    np.testing.assert_allclose(np.sqrt(track.covariance[:, 2, 2]), [3.0, 6.0])
+
+
 def test_nmea_without_the_geoids_separation_has_heights_above_the_sea(tmp_path: Path) -> None:
     def without(line: str) -> str:
         body = line[1:].split("*")[0].split(",")
