@@ -57,9 +57,16 @@ class Block:
 
 
 def cut_into_prisms(
-    path: Path, blocks: list[Block], origin: tuple[float, ...], min_height_m: float, radius_m: float
+    path: Path,
+    blocks: list[Block],
+    origin: tuple[float, ...],
+    min_height_m: float,
+    radius_m: float,
+    read: int | None = None,
 ) -> Buildings:
     """Filter buildings by height and distance from the origin and make a prism of each of their parts.
+
+    ``read`` is how many there were if some are not among the blocks, as what lies behind the earth.
 
     Raises
     ------
@@ -81,8 +88,9 @@ def cut_into_prisms(
                 raise DataError(f"{path}: {block.name}: {error}") from error
             names.append(block.name)
     if not prisms:
+        count = len(blocks) if read is None else read
         raise DataError(
-            f"{path}: none of its buildings is left: {len(blocks)} were read, none has {MIN_AREA_M2:g} m2, "
+            f"{path}: none of its buildings is left: {count} were read, none has {MIN_AREA_M2:g} m2, "
             f"min_height_m = {min_height_m:g} and lies within radius_m = {radius_m:g} of the origin "
             f"({', '.join(f'{value:g}' for value in origin)}); change the filters or the origin"
         )

@@ -163,8 +163,7 @@ def read_geojson(
     if origin_deg is not None:
         check_origin(path, "origin_deg", origin_deg, ("latitude", "longitude"))
     else:
-        middle = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
-        origin_deg = (float(middle[1]), float(middle[0]))
+        origin_deg = _middle_deg(flat)
     east, north, up = pymap3d.geodetic2enu(flat[:, 1], flat[:, 0], 0.0, *origin_deg, 0.0)
     # The plane cannot tell the far side of the earth from the near one; no filter may bring it close.
     plane = np.where((up < _FAR_SIDE_M)[:, None], np.inf, np.stack([east, north], axis=-1))
@@ -179,7 +178,18 @@ def read_geojson(
             if all(np.isfinite(ring).all() for ring in local):
                 footprint = shapely.make_valid(shapely.Polygon(local[0], local[1:]))
                 blocks.append(Block(name, footprint, 0.0, height))
-    return cut_into_prisms(path, blocks, origin_deg, min_height_m, radius_m)
+    read = sum(len(parts) for parts in polygons)
+    return cut_into_prisms(path, blocks, origin_deg, min_height_m, radius_m, read)
+
+
+def _middle_deg(points: Array) -> tuple[float, float]:
+    """Latitude and longitude in the middle of positions (n, 2), on both sides of 180 degrees, too."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    if high[0] - low[0] > 180.0:  # GeoJSON cuts at the antimeridian: what lies west of it goes on beyond 180
+        longitude = np.mod(points[:, 0], 360.0)
+        low[0], high[0] = longitude.min(), longitude.max()
+    longitude_deg, latitude_deg = (0.5 * (low + high)).tolist()
+    return latitude_deg, longitude_deg if longitude_deg <= 180.0 else longitude_deg - 360.0
 
 
 def _check_wgs84(path: Path, system: Any) -> None:

@@ -176,6 +176,30 @@ def test_default_origin_is_the_middle_whatever_is_filtered(tmp_path):
     assert len(tall.prisms) == 2
 
 
+def test_default_origin_of_buildings_on_both_sides_of_the_antimeridian(tmp_path):
+    """Taveuni, Fiji: GeoJSON cuts there (RFC 7946, 3.1.9), and half of 180 and -180 is off Africa."""
+    east, north = metres_per_degree(-16.8)
+    width, depth = 30.0 / east, 20.0 / north
+
+    def house(west, height):
+        ring = [[west, -16.8], [west + width, -16.8], [west + width, -16.8 + depth], [west, -16.8 + depth]]
+        return feature("house", height, "Polygon", [[*ring, ring[0]]])
+
+    document = {"type": "FeatureCollection", "features": [house(180.0 - width, 10.0), house(-180.0, 20.0)]}
+    town = read_geojson(write(tmp_path, document))
+    assert abs(town.origin[1]) == pytest.approx(180.0, abs=1e-9)
+    assert [prism.top_m for prism in town.prisms] == [10.0, 20.0]
+    bounds = [footprint(prism).bounds for prism in town.prisms]
+    assert bounds[0] == pytest.approx((-30.0, -10.0, 0.0, 10.0), abs=0.05)
+    assert bounds[1] == pytest.approx((0.0, -10.0, 30.0, 10.0), abs=0.05)
+
+
+def test_buildings_behind_the_earth_are_counted_as_read(tmp_path):
+    path = write(tmp_path, small_town())
+    with pytest.raises(DataError, match=r"none of its buildings is left: 5 were read, .*origin \(-34, -41\)"):
+        read_geojson(path, origin_deg=(-34.0, -41.0))
+
+
 def test_filters(tmp_path):
     path = write(tmp_path, small_town())
     here = {"origin_deg": (LATITUDE, LONGITUDE)}
