@@ -223,6 +223,10 @@ def _building_surfaces(where: str, item: dict[str, Any]) -> list[list[NDArray[np
 
 
 def _lod(where: str, geometry: dict[str, Any]) -> float:
+    if geometry.get("type") == "GeometryInstance":  # it has no lod, its template has
+        raise DataError(
+            f"{where}: geometry is a GeometryInstance, and templates are not read; write its surfaces out"
+        )
     try:
         lod = float(str(geometry.get("lod")))
     except ValueError:

@@ -348,6 +348,10 @@ def test_old_files_without_transform_and_solids_of_solids(tmp_path):
         (lambda town: court_object(town)["geometry"].pop(), "court.*LoD1"),
         (lambda town: court(town).update(lod="x"), "court.*lod"),
         (lambda town: court(town).update(type="Cube"), "court.*'Cube'"),
+        (
+            lambda town: court_object(town)["geometry"].append({"type": "GeometryInstance", "template": 0}),
+            "court.*GeometryInstance, and templates are not read",
+        ),
         (lambda town: court(town).update(boundaries=[]), "court.*empty"),
         (lambda town: court(town).update(boundaries=[[[]]]), "court.*no ring"),
         (
