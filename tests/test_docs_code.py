@@ -60,6 +60,12 @@ def test_solvers_of_ones_own_give_the_same_plan(session: dict[str, Any]) -> None
     assert len(session["timed"].seconds) == 4
 
 
+def test_a_solver_of_ones_own_is_benchmarked(session: dict[str, Any]) -> None:
+    (table,) = session["tables"]
+    correct = {row[0]: row[table.header.index("correct")] for row in table.rows}
+    assert correct == {"kernel": "100.0%", "ours": "100.0%"}
+
+
 def test_lost_navigation_is_an_event_and_a_count(session: dict[str, Any]) -> None:
     command = session["commands"][-1]
     np.testing.assert_array_equal(command.planned[0], [True, False, True, True])
