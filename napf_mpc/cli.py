@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from napf_mpc import interrupts
+from napf_mpc import __version__, interrupts
 from napf_mpc.errors import NapfError, ProblemError
 from napf_mpc.words import shown_value
 
@@ -199,6 +199,22 @@ def _show(table: Rows, quiet: bool) -> None:
 
 def _print_json(value: Any) -> None:
     print(json.dumps(value, indent=2, allow_nan=False))
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"napf-mpc {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def of_all(
+    version: Annotated[
+        bool,
+        typer.Option("--version", is_eager=True, callback=_tell_version, help="Print the version and end."),
+    ] = False,
+) -> None:
+    """What holds for every command."""
 
 
 @app.command()

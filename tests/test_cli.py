@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import napf_mpc
 from napf_mpc import interrupts, store
 from napf_mpc.cli import run_command
 from napf_mpc.problem_file import load_problem
@@ -120,6 +121,11 @@ def test_without_a_word_it_helps(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = done(capsys)
     assert (code, err) == (0, "")
     assert all(command in out for command in COMMANDS)
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_command(["--version"]) == 0
+    assert capsys.readouterr().out == f"napf-mpc {napf_mpc.__version__}\n"
 
 
 def test_the_module_is_the_command() -> None:
