@@ -175,8 +175,9 @@ def run_sweep(
     runs, seed : int
         Number of runs of each point, and campaign seed.
     out : str or Path
-        Output folder: a campaign's folder for each point, ``sweep.parquet`` and ``sweep.csv``. Another grid
-        over the same problem may go into the same folder; what it shares is not flown again.
+        Output folder: a campaign's folder for each point, ``sweep.parquet`` (a key whose values are all
+        numbers is a column of numbers there) and ``sweep.csv``. Another grid over the same problem may go
+        into the same folder; what it shares is not flown again.
     name : str
         Problem's name in the summaries.
     workers : int
@@ -189,7 +190,7 @@ def run_sweep(
     Returns
     -------
     dict of str to array
-        One row a point and planner: the keys, then rates with their ends, then medians.
+        One row a point and planner: the keys as they were written, then rates with their ends, then medians.
 
     Raises
     ------
@@ -219,7 +220,8 @@ def run_sweep(
             )
             rows += [_row(point, planner, part) for planner, part in summary["planners"].items()]
         columns = {key: np.array([row[key] for row in rows]) for key in rows[0]}
-        store.write_table(out / "sweep.parquet", columns)
+        numbers = {key: _numbers(columns[key]) for key in points[0].settings}
+        store.write_table(out / "sweep.parquet", columns | numbers)
         store.write_bytes(out / "sweep.csv", lambda file: file.write(_csv(rows).encode()))
     return columns
 
@@ -259,6 +261,18 @@ def _row(point: Point, planner: str, part: Mapping[str, Any]) -> dict[str, Any]:
         median = part[name]["median"]
         row[name] = np.nan if median is None else median
     return row
+
+
+def _numbers(texts: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Values of a key as numbers if all are, so that a program need not parse them; else as they are."""
+    for kind in (np.int64, np.float64):
+        try:
+            numbers = texts.astype(kind)
+        except (ValueError, OverflowError):
+            continue
+        if np.isfinite(numbers).all():
+            return np.asarray(numbers)
+    return texts
 
 
 def _csv(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -166,6 +166,22 @@ def test_the_tables_on_disk_hold_the_same(flown: tuple[Path, store.Columns]) -> 
     assert [row["world.shape"] for row in rows] == columns["world.shape"].tolist()
 
 
+def test_keys_that_are_numbers_are_numbers_to_a_program(flown: tuple[Path, store.Columns]) -> None:
+    stored = store.read_table(flown[0] / "sweep.parquet")
+    assert stored["planner.k"].dtype.kind in "if"
+    assert set(stored["planner.k"].tolist()) == {1, 3}
+    assert set(stored["world.shape"].tolist()) == {"sphere", "cylinder"}
+
+
+@pytest.mark.parametrize(
+    ("texts", "kind"),
+    [(["4", "-8"], "i"), (["0.5", "1e6"], "f"), (["1", "2.5"], "f"), (["1", "a"], "U"), (["1", "nan"], "U"),
+     (["true", "false"], "U"), (["[1, 2]", "[3, 4]"], "U"), (["99999999999999999999", "1"], "f")],
+)  # fmt: skip
+def test_values_are_numbers_if_all_are(texts: list[str], kind: str) -> None:
+    assert sweep._numbers(np.array(texts)).dtype.kind == kind
+
+
 def test_it_goes_on_where_it_stopped_and_takes_a_larger_grid(
     flown: tuple[Path, store.Columns], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
