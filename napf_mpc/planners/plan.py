@@ -51,6 +51,10 @@ def _stage_of(step_s: Array, age_s: float) -> tuple[int, float]:
     return k, max(0.0, age - start)
 
 
+_EARLY_S = 1e-6
+"""Clocks that count ticks differ by rounding: this much before its beginning a plan is at its beginning."""
+
+
 @compiled_bare
 def _find(
     step_s: Array, made_s: float, time_s: float, grid_s: Array, stage: Index, into_ns: Index, during: Index
@@ -200,7 +204,22 @@ class Plan:
         """State (run, uav, 12) and input about hover (run, uav, 4) at a time, by exact zero-order hold.
 
         After the last stage the inputs are zero and the model runs on.
+
+        Parameters
+        ----------
+        time_s : float
+            On the clock that the planner was stepped by, as :attr:`made_s` is; not the age of the plan [s].
+
+        Raises
+        ------
+        ValueError
+            If the plan does not begin until later.
         """
+        if not time_s >= self.made_s - _EARLY_S:
+            raise ValueError(
+                f"time_s = {time_s:g} is before the plan, which begins at made_s = {self.made_s:g}; give the "
+                "time of now on the planner's clock, not the plan's age"
+            )
         states, inputs = self.resampled(time_s, _NOW)
         return states.reshape(self.initial.shape), inputs.reshape(*self.initial.shape[:2], INPUTS)
 

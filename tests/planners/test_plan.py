@@ -51,6 +51,15 @@ def test_a_node_is_met_exactly_and_its_input_is_that_of_the_stage_it_starts() ->
         np.testing.assert_array_equal(held, flown.inputs[:, :, k + 1])
 
 
+def test_the_age_of_a_plan_is_not_its_time() -> None:
+    """Whoever asks by age would be shown the beginning for ever, and fly slower without a word."""
+    flown = plan()
+    np.testing.assert_array_equal(flown.at(7.0 - 1e-9)[0], flown.initial)
+    for age_s in (0.1, 6.99, float("nan")):
+        with pytest.raises(ValueError, match="is before the plan, which begins at made_s = 7;"):
+            flown.at(age_s)
+
+
 def test_resumed_on_its_own_grid_is_the_same_motion() -> None:
     flown = plan()
     later = flown.resumed(7.1, np.array([0.1, 0.3, 0.5]))
