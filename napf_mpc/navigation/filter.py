@@ -146,6 +146,8 @@ class KalmanFilter:
                 self._offset, model.period_s, model.bias_memory, model.barometer.drift, active
             )
         self._age += 1
+        if self._age == len(self._since):  # no epoch has come when it was due
+            self._since.append(self._since[1] @ self._since[-1])
 
     def take_in_heights(self, height: Array, active: Mask) -> None:
         """Take in heights of barometers, with a fix or without; before the fix of the same epoch.
@@ -198,7 +200,7 @@ class KalmanFilter:
             self._bar_repeated(position, velocity)
             sigma, covariance = self._watched(position, sigma, covariance, has_fix, begins, active)
         self._epoch += 1
-        self._carried[...] = self._since[-1]
+        self._carried[...] = self._since[model.ticks_per_epoch]
         kalman.correct(
             self._mean,
             self._packed,

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
+from scipy.linalg import expm
 from scipy.stats import chi2
 
 from napf_mpc.campaign import fly_block, simulate
@@ -546,6 +547,26 @@ def test_between_fixes_what_is_shared_falls_with_the_whole() -> None:
         fell += np.count_nonzero(falls) if tick % 10 else 0  # a fix at every tenth
         assert nav.trusted().all(), nav.time_s
     assert fell > 100
+
+
+def test_without_the_epoch_that_is_due_what_is_shared_is_carried_on() -> None:
+    """Whoever steps the filter by hand may go on without a fix for as long as they like."""
+    model = FilterModel.of_navigation(paper(common_mode_share=0.5), 0.02, 5)
+    kalman, still, on = KalmanFilter(model, 1, 2), np.zeros((1, 2, 3)), np.ones(1, dtype=bool)
+    covariance, fixes = np.tile(4.0 * np.eye(3), (1, 2, 1, 1)), np.ones((1, 2), dtype=bool)
+    for _ in range(3):
+        kalman.correct(still, still, covariance, fixes, True, on)
+    shared = kalman._common[0, 0, 0, 1].copy()
+    assert shared[0, 0] > 1.0
+    a = np.zeros((4, 4))  # position, velocity, error of fixes, bias: p' = v, v' = -b
+    a[0, 1], a[1, 3], a[3, 3] = 1.0, -1.0, np.log(model.bias_memory) / 0.02
+    for tick in range(1, 21):
+        kalman.predict(still, on)
+        nav = kalman.solution(0.02 * tick, still, still)
+        factor = nav.common_factor[0]
+        carried = expm(0.02 * tick * a)
+        expected = (carried @ shared @ carried.T)[0, 0]
+        assert (factor[0] @ factor[1].T)[0, 0] == pytest.approx(expected, rel=1e-4)
 
 
 def test_uavs_with_one_sigma_share_all_that_is_common() -> None:
