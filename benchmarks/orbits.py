@@ -39,7 +39,10 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="data folder")
     path = parser.parse_args().data / "gnss_nagoya_spp" / "broadcast.nav"
     # A package without types, which only this benchmark and one test use.
-    gnss: Any = import_module("cssrlib.gnss")
+    try:
+        gnss: Any = import_module("cssrlib.gnss")
+    except ImportError as error:
+        raise SystemExit("the comparison needs the package cssrlib: pip install cssrlib") from error
     orbits: Any = import_module("cssrlib.ephemeris")
     rinex: Any = import_module("cssrlib.rinex")
     nav = gnss.Nav()
