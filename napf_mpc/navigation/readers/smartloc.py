@@ -7,6 +7,7 @@ the format is that of the library libRSF.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,9 @@ ELEVATION_MASK_DEG, CN0_MASK_DBHZ = 15.0, 30.0
 _PLAIN = SolverSettings("plain", exclude=False, max_pdop=1e6)
 # Fields of a pseudorange3 record, after its name.
 _FIELDS = ("t", "range", "variance", "x", "y", "z", "satellite", "system", "elevation", "cn0")
+_RANGE_M = (1e6, 1e9)
+_ORBIT_M = (6.4e6, 1e9)
+_MAX_VARIANCE_M2 = 1e12
 
 
 def read_smartloc(path: Path | str) -> PosTrack:
@@ -59,7 +63,7 @@ def read_smartloc(path: Path | str) -> PosTrack:
         if name == "point3":
             truth.append(_numbers(path, number, words, 4))
         elif name == "pseudorange3":
-            records.append(_numbers(path, number, words, len(_FIELDS)))
+            records.append(_pseudorange(path, number, words))
         elif name != "odom3":
             raise DataError(f"{path}, line {number}: {shown_text(name)} is no record of a smartLoc log")
     if bool(truth) == bool(records):
@@ -82,11 +86,36 @@ def _numbers(path: Path, number: int, words: list[str], count: int) -> Array:
     return values
 
 
+def _pseudorange(path: Path, number: int, words: list[str]) -> Array:
+    """Numbers of a pseudorange record that can be those of a satellite."""
+    values = _numbers(path, number, words, len(_FIELDS))
+    for what, value, (low, high) in (
+        ("the range is", values[1], _RANGE_M),
+        ("the variance is", values[2], (0.0, _MAX_VARIANCE_M2)),
+        ("the satellite's distance from the earth's centre is", math.hypot(*values[3:6]), _ORBIT_M),
+    ):
+        if not low <= value <= high:
+            raise DataError(f"{path}, line {number}: {what} {value:g}, must be from {low:g} to {high:g}")
+    return values
+
+
 def _solved(path: Path, records: Array) -> PosTrack:
+    each, count = np.unique(records[:, [0, 6, 7, 1]], axis=0, return_counts=True)
+    if (count > 1).any():
+        time_s, satellite, system, _ = each[np.argmax(count > 1)]
+        raise DataError(
+            f"{path}: the range to satellite {satellite:g} of system {system:g} at {time_s:g} s is there "
+            "twice and would count double; keep one line of it"
+        )
     used = (records[:, 8] >= ELEVATION_MASK_DEG) & (records[:, 9] >= CN0_MASK_DBHZ) & (records[:, 2] > 0.0)
     records = records[used]
+    if not len(records):
+        raise DataError(
+            f"{path}: none of its {len(used)} pseudoranges has an elevation of {ELEVATION_MASK_DEG:g} deg, "
+            f"{CN0_MASK_DBHZ:g} dB Hz and a variance above zero"
+        )
     times, starts = np.unique(records[:, 0], return_index=True)
-    if len(records) and (np.diff(records[:, 0]) < 0.0).any():
+    if (np.diff(records[:, 0]) < 0.0).any():
         raise DataError(f"{path}: times of the pseudoranges go back; sort the log by time")
     kept, places, covariances = [], [], []
     place: Array | None = None

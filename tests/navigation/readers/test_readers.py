@@ -262,6 +262,11 @@ def test_smartloc_is_as_far_off_as_its_readme_says(data_folder: Path) -> None:
         ("point3 0 1 2 nan\n", "line 1: a number is not finite"),
         ("hello 1 2\n", "line 1: hello is no record"),
         ("pseudorange3 0 2e7 4 2e7 0 0 5 1 40 45\n", "no epochs with a 3-D fix"),
+        ("pseudorange3 0 2e7 4 0 0 0 5 1 40 45\n", "line 1: the satellite's distance from the earth's"),
+        ("pseudorange3 0 1e300 4 2e7 0 0 5 1 40 45\n", "line 1: the range is 1e+300, must be from 1e+06"),
+        ("pseudorange3 0 2e7 -4 2e7 0 0 5 1 40 45\n", "line 1: the variance is -4, must be from 0"),
+        ("pseudorange3 0 2e7 0 2e7 0 0 5 1 40 45\n", "none of its 1 pseudoranges has an elevation of 15 deg"),
+        (2 * "pseudorange3 0 2e7 4 2e7 0 0 5 1 40 45\n", "satellite 5 of system 1 at 0 s is there twice"),
     ],
 )
 def test_smartloc_that_is_none(tmp_path: Path, text: str, words: str) -> None:
