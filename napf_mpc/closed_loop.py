@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -246,7 +247,8 @@ def closed_loop(
     waited_s = np.zeros(runs)
     finish_time = np.full(runs, np.nan)
     duration = np.zeros(runs)
-    planner.reset(scenario.obstacles, runs)
+    own = not type(planner).__module__.startswith("napf_mpc.")
+    planner.reset(deepcopy(scenario.obstacles) if own else scenario.obstacles, runs)
     filtered = _filtered(problem, scenario, clock)
     tracker = _tracker(problem, scenario, clock)
     unfiltered = _Unfiltered(fixes_of_flight(scenario.errors), clock) if filtered is None else None
@@ -272,7 +274,7 @@ def closed_loop(
             airborne = np.repeat(active[:, None], state.shape[1], axis=1)
             tracks = None if tracker is None else tracker.tracks()
             shown = replace(nav, airborne=airborne, tracks=tracks, sigma_map=scenario.sigma_map)
-            command = planner.step(shown, time_s)
+            command = planner.step(_of_its_own(shown) if own else shown, time_s)
             check_command(command, planner.name, (runs, state.shape[1]))
             holding[active] = command.holding[active].any(-1)
             if command.reason is not None:
@@ -315,6 +317,16 @@ def closed_loop(
         waited_s,
         None if filtered is None else filtered.monitor,
     )
+
+
+def _of_its_own(nav: NavSolution) -> NavSolution:
+    """Solution for a planner that may write into it, as ``nav.position -= centre`` does.
+
+    The inner loop flies by the original, the verdict reads it, and a fix is shown until the next one comes.
+    """
+    told: dict[str, Any] = {each.name: getattr(nav, each.name) for each in fields(nav)}
+    own: dict[str, Any] = {name: each.copy() for name, each in told.items() if isinstance(each, np.ndarray)}
+    return replace(nav, **own)
 
 
 @dataclass(frozen=True)

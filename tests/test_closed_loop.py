@@ -592,6 +592,34 @@ def test_a_run_does_not_wait_once_it_has_ended() -> None:
     np.testing.assert_allclose(flight.waited_s, flight.finish_time_s, atol=1e-9)
 
 
+class Careless(NapfPlanner):
+    """Decides as always, then writes into what it was given, as ``nav.position -= centre`` does."""
+
+    def reset(self, obstacles: ObstacleSet, runs: int) -> None:
+        super().reset(ObstacleSet.from_shapes(obstacles.shapes()), runs)
+        obstacles.solids.parameters[...] = 1e3
+
+    def step(self, nav: NavSolution, time_s: float) -> Command:
+        command = super().step(nav, time_s)
+        for values in (nav.position, nav.velocity, nav.covariance, nav.common_factor, nav.available):
+            values[...] = 0
+        return command
+
+
+@pytest.mark.parametrize("kind", ["none", "kalman", "point_mass"])
+def test_a_planner_that_writes_into_what_it_is_given_changes_nothing_else(kind: str) -> None:
+    """The inner loop, the verdict and the next planner must not see a formation or a map that it made up."""
+    problem = short("lanes", f"navigation.filter={kind}")
+    careful, careless = (
+        simulate(problem, planner, seed=3, record_every=25)
+        for planner in (NapfPlanner(problem), Careless(problem))
+    )
+    for name, values in careful.score.metrics.items():
+        np.testing.assert_array_equal(careless.score.metrics[name], values, err_msg=name)
+    for name in ("x_m", "est_x_m", "sigma_x_m", "available"):
+        np.testing.assert_array_equal(careless.trajectories[name], careful.trajectories[name], err_msg=name)
+
+
 # ------------------------------------------------------------------------------------------ thrust for tilt
 
 
