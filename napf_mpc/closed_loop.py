@@ -231,6 +231,12 @@ def closed_loop(
     -------
     Flight
         Per run.
+
+    Raises
+    ------
+    ValueError
+        If the errors' period is no whole multiple of the inner loop's, or a fix of theirs is none, or one of
+        other runs and UAVs.
     """
     mission = formation_mission(problem)
     clock = _Clock.of_problem(problem, scenario.errors.period_s)
@@ -344,12 +350,18 @@ class _Clock:
     def of_problem(cls, problem: Problem, fix_period_s: float) -> _Clock:
         simulation = problem.simulation
         period = 1.0 / simulation.controller_rate_hz
+        ticks_per_fix = fix_period_s / period
+        if not (ticks_per_fix > 0.5 and abs(ticks_per_fix - round(ticks_per_fix)) < 1e-6):
+            raise ValueError(
+                f"errors have period_s = {fix_period_s:g}, must be one or more whole periods of the inner "
+                f"loop, {period:g} s (simulation.controller_rate_hz = {simulation.controller_rate_hz:g})"
+            )
         return cls(
             step_s=simulation.step_s,
             period_s=period,
             steps_per_tick=round(period / simulation.step_s),
             ticks_per_plan=round(simulation.controller_rate_hz / problem.planner.rate_hz),
-            ticks_per_fix=round(fix_period_s / period),
+            ticks_per_fix=round(ticks_per_fix),
             ticks=max(1, math.ceil(simulation.time_limit_s / period - 1e-9)),
         )
 

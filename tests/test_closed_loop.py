@@ -461,6 +461,38 @@ def test_errors_of_fewer_runs_are_no_failed_runs(filter_: str) -> None:
         fly(problem, NapfPlanner(problem), replace(scenario, errors=OfOneRun(scenario.errors)))
 
 
+@pytest.mark.parametrize("period_s", [0.03, 0.001, 0.0, -0.1, float("nan")])
+def test_errors_whose_period_does_not_fit_the_inner_loop_are_refused(period_s: float) -> None:
+    """Rounded to whole ticks, a drift of an own error model would run at another pace."""
+    problem = empty()
+    scenario = build_scenario(problem, 0, range(1))
+
+    class Own:
+        def __init__(self) -> None:
+            self.period_s = period_s
+
+        def fix(self, epoch: int) -> Fix:
+            raise AssertionError("not to be asked")
+
+    with pytest.raises(ValueError, match=r"errors have period_s = .*, must be one or more whole periods"):
+        closed_loop(problem, ApfPlanner(problem), replace(scenario, errors=Own()))
+
+
+@pytest.mark.parametrize("filter_", ["none", "kalman"])
+def test_errors_that_return_no_fix_are_told(filter_: str) -> None:
+    problem = empty(f"navigation.filter={filter_}")
+    scenario = build_scenario(problem, 0, range(1))
+
+    class Own:
+        period_s = 0.1
+
+        def fix(self, epoch: int) -> Fix:
+            return None  # type: ignore[return-value]
+
+    with pytest.raises(ValueError, match="fix of epoch 0 is a NoneType, must be a Fix"):
+        closed_loop(problem, ApfPlanner(problem), replace(scenario, errors=Own()))
+
+
 def test_a_run_beyond_all_numbers_has_failed() -> None:
     """An estimate 1e6 km off: whatever that run does, the others fly as before."""
     problem = short("lanes")

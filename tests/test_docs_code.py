@@ -155,3 +155,10 @@ def test_a_frozen_weight_leaps_and_the_second_order_model_does_not() -> None:
 def test_modules_exist(page: str) -> None:
     for name in set(re.findall(r"`(napf_mpc(?:\.\w+)+)`", page)):
         assert importlib.util.find_spec(name), name
+
+
+def test_errors_of_ones_own_are_flown_and_judged(session: dict[str, Any]) -> None:
+    score, errors = session["drifted"], session["scenario"].errors
+    assert [str(outcome) for outcome in score.outcome] == ["reached"] * 3
+    np.testing.assert_allclose(errors.fix(10).error, errors.drift)  # after a second
+    assert (score.metrics["within_k_sigma_east"] > 0.9).all()

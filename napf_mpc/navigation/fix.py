@@ -67,8 +67,10 @@ def check_shapes(fix: Fix, epoch: int, runs: int, uavs: int) -> None:
     Raises
     ------
     ValueError
-        Naming the array, its shape and the one needed.
+        If it is no fix, or naming the array, its shape and the one needed.
     """
+    if not isinstance(fix, Fix):
+        raise ValueError(f"fix of epoch {epoch} is a {type(fix).__name__}, must be a Fix")
     block = (runs, uavs)
     rank = fix.common_factor.shape[-1:]
     for name, array, needed in (
