@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -231,6 +232,7 @@ class QpPlanner:
         self._grid = np.append(0.0, step)  # now, and the ends of the stages
         self._yaw = self._frame.heading_rad
         self._model = horizon_model(problem.vehicle, self._yaw, step, *weights(settings, problem.vehicle))
+        self._solver_name = settings.solver if solver is None else solver if isinstance(solver, str) else None
         solver = _solver_of(problem) if solver is None else solver
         self._solver = make_batch_solver(solver) if isinstance(solver, str) else solver
         self._layout: Layout | None = None
@@ -239,6 +241,25 @@ class QpPlanner:
             self._model, mixer_inverse(problem.vehicle), -hover, rotor_limit(problem.vehicle) - hover
         )
         self.reset(ObstacleSet.empty(), 0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or a pickle takes along; a solver that has a name is made anew, without its workspace.
+
+        Arrays of a workspace share memory. Those of a copy do not: it would solve something else.
+        """
+        state = vars(self).copy()
+        if self._solver_name is not None:
+            del state["_solver"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become what was taken along."""
+        vars(self).update(state)
+        if self._solver_name is not None:
+            self._solver = make_batch_solver(self._solver_name)
+        # What is counted stands in one array, and in the tally by name.
+        counted: Tally = state["tally"]
+        self.tally = replace(counted, counts=Tally.over(self._counts).counts)
 
     @property
     def name(self) -> str:
