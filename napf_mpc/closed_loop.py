@@ -44,6 +44,7 @@ from napf_mpc.vehicle.lqr import check_sampled_loop
 from napf_mpc.vehicle.plant import advance, plain
 from napf_mpc.vehicle.quadrotor import parameters
 from napf_mpc.vehicle.tracking import TrackingLaw, tracking_law
+from napf_mpc.world.distance import Solids
 from napf_mpc.world.moving import MovingObstacles, moving_obstacles
 from napf_mpc.world.obstacles import ObstacleSet
 from napf_mpc.world.scenes import build_scenes
@@ -234,6 +235,8 @@ def closed_loop(
 
     Raises
     ------
+    ProblemError
+        If a planner returns no command that fits, or writes into the map.
     ValueError
         If the errors' period is no whole multiple of the inner loop's, or a fix of theirs is none, or one of
         other runs and UAVs.
@@ -254,7 +257,10 @@ def closed_loop(
     finish_time = np.full(runs, np.nan)
     duration = np.zeros(runs)
     own = not type(planner).__module__.startswith("napf_mpc.")
-    planner.reset(deepcopy(scenario.obstacles) if own else scenario.obstacles, runs)
+    as_built = deepcopy(scenario.obstacles.solids) if own else None
+    planner.reset(scenario.obstacles, runs)
+    if as_built is not None:
+        _check_untouched(scenario.obstacles.solids, as_built, planner.name)
     filtered = _filtered(problem, scenario, clock)
     tracker = _tracker(problem, scenario, clock)
     unfiltered = _Unfiltered(fixes_of_flight(scenario.errors), clock) if filtered is None else None
@@ -311,6 +317,8 @@ def closed_loop(
         if not active.any():
             break
     duration[active] = clock.ticks * clock.period_s
+    if as_built is not None:
+        _check_untouched(scenario.obstacles.solids, as_built, planner.name)
     return Flight(
         np.isfinite(finish_time),
         failed,
@@ -323,6 +331,26 @@ def closed_loop(
         waited_s,
         None if filtered is None else filtered.monitor,
     )
+
+
+def _check_untouched(solids: Solids, as_built: Solids, planner: str) -> None:
+    """Refuse a planner that wrote into the map: the verdict and the other planners have the same one.
+
+    Raises
+    ------
+    ProblemError
+        After the map is what it was.
+    """
+    changed = False
+    for now, before in zip(solids, as_built, strict=True):
+        if not np.array_equal(now, before, equal_nan=True):
+            changed = True
+            now[...] = before
+    if changed:
+        raise ProblemError(
+            f'planner "{planner}"',
+            ["wrote into the obstacles that it was given, which are those of the verdict: work on a copy"],
+        )
 
 
 def _of_its_own(nav: NavSolution) -> NavSolution:

@@ -627,10 +627,6 @@ def test_a_run_does_not_wait_once_it_has_ended() -> None:
 class Careless(NapfPlanner):
     """Decides as always, then writes into what it was given, as ``nav.position -= centre`` does."""
 
-    def reset(self, obstacles: ObstacleSet, runs: int) -> None:
-        super().reset(ObstacleSet.from_shapes(obstacles.shapes()), runs)
-        obstacles.solids.parameters[...] = 1e3
-
     def step(self, nav: NavSolution, time_s: float) -> Command:
         command = super().step(nav, time_s)
         for values in (nav.position, nav.velocity, nav.covariance, nav.common_factor, nav.available):
@@ -640,7 +636,7 @@ class Careless(NapfPlanner):
 
 @pytest.mark.parametrize("kind", ["none", "kalman", "point_mass"])
 def test_a_planner_that_writes_into_what_it_is_given_changes_nothing_else(kind: str) -> None:
-    """The inner loop, the verdict and the next planner must not see a formation or a map that it made up."""
+    """The inner loop and the verdict must not see a formation that it made up."""
     problem = short("lanes", f"navigation.filter={kind}")
     careful, careless = (
         simulate(problem, planner, seed=3, record_every=25)
@@ -650,6 +646,35 @@ def test_a_planner_that_writes_into_what_it_is_given_changes_nothing_else(kind: 
         np.testing.assert_array_equal(careless.score.metrics[name], values, err_msg=name)
     for name in ("x_m", "est_x_m", "sigma_x_m", "available"):
         np.testing.assert_array_equal(careless.trajectories[name], careful.trajectories[name], err_msg=name)
+
+
+class Inflating(NapfPlanner):
+    """Makes obstacles larger where they stand, at the reset or under way."""
+
+    when_s = -1.0
+
+    def reset(self, obstacles: ObstacleSet, runs: int) -> None:
+        super().reset(obstacles, runs)
+        self.map = obstacles
+        if self.when_s < 0.0:
+            obstacles.solids.parameters[:] += 0.5
+
+    def step(self, nav: NavSolution, time_s: float) -> Command:
+        if time_s == self.when_s:
+            self.map.solids.parameters[:] += 0.5
+        return super().step(nav, time_s)
+
+
+@pytest.mark.parametrize("when_s", [-1.0, 1.0])
+def test_a_planner_that_writes_into_the_map_is_refused_and_the_map_is_as_it_was(when_s: float) -> None:
+    problem = short("lanes")
+    scenario = build_scenario(problem, 3, range(2))
+    before = scenario.obstacles.solids.parameters.copy()
+    planner = Inflating(problem)
+    planner.when_s = when_s
+    with pytest.raises(ProblemError, match='planner "napf": wrote into the obstacles that it was given'):
+        closed_loop(problem, planner, scenario)
+    np.testing.assert_array_equal(scenario.obstacles.solids.parameters, before)
 
 
 # ------------------------------------------------------------------------------------------ thrust for tilt
