@@ -243,7 +243,7 @@ class QpPlanner:
         self.reset(ObstacleSet.empty(), 0)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy or a pickle takes along; a solver that has a name is made anew, without its workspace.
+        """What a copy takes along; a solver that has a name is made anew, without its workspace.
 
         Arrays of a workspace share memory. Those of a copy do not: it would solve something else.
         """

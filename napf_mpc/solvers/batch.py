@@ -176,6 +176,10 @@ class PerUavSolver:
         self._model: HorizonModel | None = None
         self._backends: dict[tuple[int, int], Backend | None] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy takes along: no workspaces, which are the libraries' own."""
+        return vars(self) | {"_backends": {}}
+
     def reset(self) -> None:
         """Forget all workspaces."""
         self._backends.clear()

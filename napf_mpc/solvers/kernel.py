@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -156,6 +157,10 @@ class KernelSolver:
             raise TypeError(f"max_iter = {max_iter!r}, must be a whole number > 0")
         self._limit = max_iter
         self._home: _Home | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy takes along: no workspace, whose arrays share memory that a copy's do not."""
+        return vars(self) | {"_home": None}
 
     def reset(self) -> None:
         """Nothing to forget: a solve depends on its numbers and its guess alone."""

@@ -26,6 +26,8 @@ __all__ = ["read_nmea"]
 Array = NDArray[np.float64]
 
 DAY_S = 86_400.0
+_NO_FIX = (0, 6, 7)
+"""Qualities of GGA without satellites behind them: none, dead reckoning, typed in."""
 _SENTENCE = re.compile(r"\$[A-Z]{2}(GGA|GST|ZDA|RMC),")
 
 
@@ -46,8 +48,8 @@ def read_nmea(path: Path | str) -> PosTrack:
     Returns
     -------
     PosTrack
-        Epochs whose GGA says that there is a fix; without a GST of the same time, of zero covariance, as a
-        truth has it. The time system is ``UTC``.
+        Epochs whose GGA says that there is a fix by satellites; without a GST of the same time, of zero
+        covariance, as a truth has it. The time system is ``UTC``.
 
     Raises
     ------
@@ -75,7 +77,7 @@ def read_nmea(path: Path | str) -> PosTrack:
         epoch = clock.count(message.time)
         if kind[1] == "GST":
             reports.append((epoch, _covariance(place, message)))
-        elif message.quality != 0:
+        elif message.quality not in _NO_FIX:
             values = (message.lat, message.lon, message.alt)
             separation = message.sep if message.sep != "" else 0.0
             if "" in values:

@@ -93,6 +93,8 @@ def test_nmea_goes_on_over_midnight_and_leaves_out_what_has_no_fix(tmp_path: Pat
         zda("23:59:58", 11),
         gga("23:59:59", PLACE),
         gga("00:00:00", PLACE, quality=0),
+        gga("00:00:00.5", PLACE, quality=6),  # dead reckoning
+        gga("00:00:00.8", PLACE, quality=7),  # typed in
         gga("00:00:01", PLACE),
         zda("00:00:02", 12),
         gga("00:00:03", PLACE),
