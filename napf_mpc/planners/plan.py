@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
+from napf_mpc.errors import ProblemError
 from napf_mpc.jit import compiled, compiled_bare
 from napf_mpc.problem import Vehicle
 from napf_mpc.qp import INPUTS, STATES, HorizonModel
@@ -20,6 +21,8 @@ Index = NDArray[np.int64]
 
 _NOW = np.zeros(1)
 """A grid of a single time."""
+LEAST_WEIGHT = 1e-6
+"""Least weight of a state, per second, with which is worked out what is left to pay at the horizon's end."""
 
 
 @lru_cache(maxsize=4096)
@@ -171,12 +174,31 @@ def horizon_model(
     state_weight, input_weight : array, shapes (12,) and (4,)
         Diagonals of Q and R per second; the horizontal weights must be equal along both axes, so that the
         Hessian does not depend on the heading.
+
+    Raises
+    ------
+    ProblemError
+        If the weights are too far apart for the Riccati equation to be solved.
     """
     held = [_held(vehicle, yaw_rad, float(step)) for step in step_s]
     a, b = np.stack([pair[0] for pair in held]), np.stack([pair[1] for pair in held])
     q = np.diag(state_weight)[None] * step_s[:, None, None]
     r = np.diag(input_weight)[None] * step_s[:, None, None]
-    q[-1] = solve_discrete_are(a[-1], b[-1], np.diag(state_weight) * step_s[-1], r[-1])
+    # What costs nothing on the way costs next to nothing after it: a yaw without a price would have no limit.
+    after = np.maximum(state_weight, LEAST_WEIGHT)
+    try:
+        q[-1] = solve_discrete_are(a[-1], b[-1], np.diag(after) * step_s[-1], r[-1])
+    except (np.linalg.LinAlgError, ValueError) as error:
+        asked = ", ".join(f"{weight:g}" for weight in (*state_weight[[0, 1, 6]], *input_weight[:2]))
+        names = "position_weight, velocity_weight, attitude_weight, thrust_weight and torque_weight"
+        raise ProblemError(
+            "planner",
+            [
+                f"{names} = {asked} with a last stage of {step_s[-1]:g} s: too far apart, what is left to "
+                "pay at the horizon's end cannot be computed; choose them nearer to their defaults, or a "
+                "shorter look_ahead_s"
+            ],
+        ) from error
     q[-1] = 0.5 * (q[-1] + q[-1].T)
     return HorizonModel(np.array(step_s, dtype=float), a, b, q, r)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from napf_mpc.errors import ProblemError
 from napf_mpc.planners.plan import Plan, horizon_model, stage_grid, standing_plan, straight_plan
 from napf_mpc.problem import Vehicle
 from napf_mpc.vehicle.quadrotor import linearize
@@ -124,3 +125,19 @@ def test_the_terminal_weight_is_what_is_left_to_pay() -> None:
         cost += 0.2 * (x @ (q * x) + u @ (r * u))
         x = a @ x + b @ u
     assert start @ p @ start == pytest.approx(cost, rel=1e-9)
+
+
+def test_a_state_without_a_price_has_a_terminal_weight_all_the_same() -> None:
+    """``planner.attitude_weight = 0`` is allowed: a yaw that costs nothing has nothing left to pay."""
+    q = np.where(np.arange(12) < 6, 5.0, 0.0)
+    model = horizon_model(VEHICLE, 0.0, STEP, q, np.array([60.0, 600.0, 600.0, 600.0]))
+    assert np.linalg.eigvalsh(model.q[-1]).min() > -1e-9
+    assert model.q[-1][0, 0] > 1.0
+    assert model.q[-1][10, 10] < 0.1
+
+
+def test_weights_too_far_apart_are_named() -> None:
+    weight = np.full(12, 1e-6)
+    weight[1:6:2], weight[6:] = 0.0, 1e6
+    with pytest.raises(ProblemError, match=r"_weight = 1e-06, 0, 1e\+06, .*too far apart"):
+        horizon_model(Vehicle(mass_kg=0.01, inertia_kgm2=(1e-6, 1e-6, 1e-6)), 0.0, STEP, weight, np.ones(4))
