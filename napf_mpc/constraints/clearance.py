@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from napf_mpc.constraints.clearance_rows import (
     NEWTON_STEPS,
     contact_rows,
+    firm_prices,
     held_distances,
     influence_rows,
     shortfalls,
@@ -52,6 +53,8 @@ times that leaves room for other weights, and is still an order below what spoil
 """
 CONTACT_W2 = 100.0
 """Quadratic price of a contact slack [1/(m^2 s)]: spreads what cannot be met over the stages."""
+NARROW_M = 1.3
+"""Margin below which the linear price may rise, see :class:`ObstacleContact` [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,11 +426,20 @@ class ObstacleContact(_Shell):
     """Linear price of the slack [1/(m s)]."""
     w2: float = CONTACT_W2
     """Quadratic price of the slack [1/(m^2 s)]."""
+    narrow_w1: float = 0.0
+    """Linear price up to which ``w1`` rises where the margin is less than ``narrow_m``, with the inverse cube
+    of it [1/(m s)]. A plan that gains by cutting a corner cuts it by decimetres, whatever the margin is: that
+    is a part of one of metres, and a contact with one of centimetres."""
+    narrow_m: float = NARROW_M
+    """See there [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_extra(self.extra_m, self.extra_sigmas)
         check_opening(self.opening_mps)
+        for name in ("narrow_w1", "narrow_m"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ConstraintError(f"{name} = {getattr(self, name)!r}, must be >= 0")
 
     @property
     def name(self) -> str:
@@ -461,8 +473,11 @@ class ObstacleContact(_Shell):
             gaps.normal, gaps.shifted, gaps.sigma, plain(horizon.position), *self._extra(), opening,
             horizon.times_s, lower,
         )  # fmt: skip
-        prices = even_prices((*horizon.shape, 1), self.w1, self.w2)
-        return LinearRows("position", gaps.normal, lower, None, *prices, shared_slack=True)
+        w1, w2 = even_prices((*horizon.shape, 1), self.w1, self.w2)
+        if self.narrow_w1 > self.w1:
+            shift = (self.inflation or Inflation.of_problem(horizon.problem)).mode == "shift"
+            firm_prices(gaps.shifted, gaps.margin, shift, self.w1, self.narrow_w1, self.narrow_m, w1)
+        return LinearRows("position", gaps.normal, lower, None, w1, w2, shared_slack=True)
 
 
 @dataclass(frozen=True)

@@ -114,6 +114,37 @@ def contact_rows(
                     lower[run, uav, k, j] = level + (asked - rho)
 
 
+@compiled
+def firm_prices(
+    shifted: Array, margin: Array, shift: bool, w1: float, narrow_w1: float, narrow_m: float, price: Array
+) -> None:
+    """Write linear prices of contact slacks: by the least margin that a stage keeps.
+
+    Parameters
+    ----------
+    shifted, margin : array, shape (run, uav, N, M)
+        As in :class:`.clearance.Gaps`.
+    shift : bool
+        Whether margins are kept; one that widens the range only is none.
+    w1, narrow_w1, narrow_m : float
+        See :class:`.clearance.ObstacleContact`.
+    price : array, shape (run, uav, N, 1)
+        [1/(m s)].
+    """
+    for run in range(shifted.shape[0]):
+        for uav in range(shifted.shape[1]):
+            for k in range(shifted.shape[2]):
+                least = np.inf
+                for j in range(shifted.shape[3]):
+                    if shifted[run, uav, k, j] < np.inf:
+                        least = min(least, margin[run, uav, k, j] if shift else 0.0)
+                price[run, uav, k, 0] = w1
+                if least < narrow_m:
+                    # The cube, for what is cut of a corner counts soon as margins shrink.
+                    firm = w1 * (narrow_m / least) ** 3 if least > 0.0 else narrow_w1
+                    price[run, uav, k, 0] = min(max(firm, w1), narrow_w1)
+
+
 @compiled_bare
 def held_distances(
     shifted: Array, influence: Array, least_m: float, ratio: float, root: float, held: Array

@@ -112,6 +112,7 @@ def default_constraints(problem: Problem) -> list[Constraint]:
         extra_sigmas=settings.contact_extra_sigmas,
         opening_mps=leaving,
         margin=margin,
+        narrow_w1=firm_price(problem) if settings.contact_price is None else 0.0,
     )
     most = REPULSION_PART * price if price > 0.0 else math.inf
     influence = ObstacleInfluence(
@@ -144,8 +145,11 @@ def contact_price(problem: Problem) -> float:
     asked = problem.planner.contact_price
     if asked is not None:
         return asked
-    if not _is_fast(problem):
-        return CONTACT_PRICE
+    return firm_price(problem) if _is_fast(problem) else CONTACT_PRICE
+
+
+def firm_price(problem: Problem) -> float:
+    """Price of a margin for fast formations, and of the margins of small errors [1/(m s)]."""
     return FAST_RAW_CONTACT_PRICE if problem.navigation.filter == "none" else FAST_CONTACT_PRICE
 
 

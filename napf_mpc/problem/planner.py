@@ -55,7 +55,7 @@ class Planner(Section):
     torque_weight: Annotated[float, Field(ge=1e-9, le=1e6)] | None = None
     """QP planner: weight of the torques [1/(N^2 m^2 s)]; by default 600 for the paper's vehicle, and for others what prices the same angular acceleration alike."""  # noqa: E501
     contact_price: Annotated[float, Field(ge=0.0, le=1e9)] | None = None
-    """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]; by default 300, and for formations faster than 4 m/s, whose slots run away from who has to wait or turn, 3000 behind a filter and 1000 on raw measurements."""  # noqa: E501
+    """QP planner: linear price of being inside an obstacle's or a neighbour's margin [1/(m s)]; by default 300, and for formations faster than 4 m/s, whose slots run away from who has to wait or turn, 3000 behind a filter and 1000 on raw measurements; for slower ones that of obstacles rises to the same where k sigma is less than 1.3 m."""  # noqa: E501
     tilt_thrust: bool | None = None
     """QP planner: whether thrust makes up for tilt, so that nobody sinks in sharp turns; by default for formations faster than 4 m/s."""  # noqa: E501
     margin: Literal["half_space", "passage"] = "half_space"
