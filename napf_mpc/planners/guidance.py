@@ -279,7 +279,7 @@ class Guidance:
             if self._room_m > 0.0:
                 room = room_outwards(*there, self._room_m)
             self._taut = pulled, loose, room
-        self._hold(offset, elapsed_s, measured)
+        self._hold(place[..., 0] - along, offset, elapsed_s, measured)
 
     def _separation(self, covariance: Array) -> Array:
         """Distances (run, uav, uav) to keep between UAVs: k sigma of both, as far as slots allow."""
@@ -287,7 +287,7 @@ class Guidance:
         wanted = self._min_separation + self._inflation.k * np.sqrt(variance[:, :, None] + variance[:, None])
         return np.minimum(wanted, self.settings.apart_share * self._slot_distance)
 
-    def _hold(self, offset: Array, elapsed_s: float, measured: bool) -> None:
+    def _hold(self, past: Array, offset: Array, elapsed_s: float, measured: bool) -> None:
         """Decide per run how fast to go on, from what is blocked ahead and how near it is."""
         settings = self.settings
         distance, squeezed, aside, slope, sigma = np.empty((5, len(offset)))
@@ -295,10 +295,13 @@ class Guidance:
         k = max(self._inflation.k, settings.measured_k) if measured else self._inflation.k
         margin = k * sigma
         scale = np.maximum(1.0, margin / settings.usual_margin_m) ** settings.tolerance_power
-        few, many = settings.tolerance_m * scale, max(settings.tolerance_m, settings.squeeze_m) * scale
+        # Of errors of centimetres that would be more than the margin; never is any of the radius let go.
+        most = np.where(margin < settings.usual_margin_m, settings.breach_share * margin, np.inf)
+        few = np.minimum(settings.tolerance_m * scale, most)
+        many = np.minimum(max(settings.tolerance_m, settings.squeeze_m) * scale, most)
         _measure(
-            self._missing, self._profiles, offset, self.ahead_m, settings.spare_m, few, many, self._bends,
-            self._step_m, distance, squeezed, aside, slope,
+            self._missing, self._profiles, past, offset, self.ahead_m, settings.spare_m, few, many,
+            self._bends, self._step_m, distance, squeezed, aside, slope,
         )  # fmt: skip
         self._squeezing &= distance <= settings.stop_m + settings.slow_m
         self._squeezing |= self._held_s >= settings.squeeze_after_s
@@ -398,8 +401,9 @@ def _largest_sigma(covariance: Array, sigma: Array) -> None:
 
 @compiled_bare
 def _measure(
-    missing: Array, profiles: Array, offset: Array, ahead_m: Array, spare_m: float, few_m: Array,
-    many_m: Array, bends: int, step_m: float, distance: Array, squeezed: Array, aside: Array, slope: Array,
+    missing: Array, profiles: Array, past: Array, offset: Array, ahead_m: Array, spare_m: float,
+    few_m: Array, many_m: Array, bends: int, step_m: float, distance: Array, squeezed: Array, aside: Array,
+    slope: Array,
 ) -> None:  # fmt: skip
     """Write what there is to decide from, of the ways ahead of each run.
 
@@ -407,8 +411,8 @@ def _measure(
     ----------
     missing, profiles : array, shapes (run, uav, station) and (run, uav, station, 2)
         Of the last plan [m].
-    offset : array, shape (run, uav, 2)
-        Of the UAVs now [m].
+    past, offset : array, shape (run, uav) and (run, uav, 2)
+        How far UAVs are past the first station, and their offsets now [m].
     ahead_m : array, shape (station,)
         [m].
     spare_m : float
@@ -439,8 +443,12 @@ def _measure(
                     distance[run] = min(distance[run], ahead_m[s])
                 if worse > many_m[run]:
                     squeezed[run] = min(squeezed[run], ahead_m[s])
+            # The first station is up to a step behind: on a steep way that is metres aside.
+            lower = min(int(past[run, uav] / step_m), way.shape[0] - 2)
+            part = past[run, uav] / step_m - lower
             for a in range(2):
-                aside[run] = max(aside[run], abs(way[0, a] - offset[run, uav, a]))
+                there = (1.0 - part) * way[lower, a] + part * way[lower + 1, a]
+                aside[run] = max(aside[run], abs(there - offset[run, uav, a]))
             for s in range(min(bends, way.shape[0]) - 1):
                 left, up = (way[s + 1, 0] - way[s, 0]) / step_m, (way[s + 1, 1] - way[s, 1]) / step_m
                 slope[run] = max(slope[run], math.sqrt(left * left + up * up))
