@@ -24,9 +24,12 @@ from napf_mpc.planners.guide_clearance import (
     ROUND,
     SIGMAS,
     TOUCHED,
+    TOUCHING_M,
     UP,
     Sight,
+    half_step_of,
     is_round,
+    nearest_along,
     round_shortfall,
     shortfall,
 )
@@ -189,6 +192,63 @@ def way_across(short: float, distance: float, across: float) -> float:
 
 
 @compiled_bare
+def touches(sight: Sight, i: int, step_m: float, along: float, left: float, up: float) -> bool:
+    """Whether a UAV would touch something at a place, or within half a step of it where that is thin."""
+    near = sight.near
+    for entry in range(sight.solid_count[i]):
+        half_step = half_step_of(near[i, entry], np.inf, step_m)
+        if along < near[i, entry, LOW] - half_step or along > near[i, entry, HIGH] + half_step:
+            continue
+        if left < near[i, entry, LOW + 1] or left > near[i, entry, HIGH + 1]:
+            continue
+        if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
+            continue
+        at = along
+        if half_step > 0.0:
+            at = nearest_along(near[i, entry], sight.reach[i], along, half_step, step_m)
+        distance = shortfall(
+            sight.solids, sight.found[i, entry], sight.frame, at, left, up, sight.covariance[i], 0.0, 0.0
+        )[3]
+        if distance < sight.radius_m:
+            return True
+    return False
+
+
+@compiled_bare
+def mend(sight: Sight, i: int, coarse: Array, every: int, step_m: float, fine: Array) -> None:
+    """Lead a draft round the corners that it cuts between two stations of the lattice, in place.
+
+    The search asks at its stations alone. Where a place in between would touch, and one of the two that it
+    lies between would not if it were kept up to there, that is taken.
+
+    Parameters
+    ----------
+    sight, i : Sight, int
+        What UAV i sees.
+    coarse, fine : array, shapes (station, 2) and (fine station, 2)
+        The search's profile and the draft [m].
+    every : int
+        Stations of the draft for one of the search.
+    step_m : float
+        From one of the draft's to the next [m].
+    """
+    lane, height = sight.lanes[i, 0], sight.lanes[i, 1]
+    for s in range(fine.shape[0]):
+        if s % every == 0:
+            continue
+        along = sight.along[i] + s * step_m
+        if not touches(sight, i, step_m, along, lane + fine[s, 0], height + fine[s, 1]):
+            continue
+        # The nearer one first.
+        before, after = s // every, min(s // every + 1, coarse.shape[0] - 1)
+        first, second = (before, after) if 2 * (s % every) < every else (after, before)
+        for n in (first, second):
+            if not touches(sight, i, step_m, along, lane + coarse[n, 0], height + coarse[n, 1]):
+                fine[s, 0], fine[s, 1] = coarse[n, 0], coarse[n, 1]
+                break
+
+
+@compiled_bare
 def take_solids(
     sight: Sight,
     i: int,
@@ -223,11 +283,14 @@ def take_solids(
     for entry in range(sight.solid_count[i]):
         if lowest > near[i, entry, HIGH + 1] or highest < near[i, entry, LOW + 1]:
             continue
-        s0 = max(0, int(np.ceil((near[i, entry, LOW] - start) / step_m)))
-        s1 = min(stations - 1, int(np.floor((near[i, entry, HIGH] - start) / step_m)))
+        half_step = half_step_of(near[i, entry], np.inf, step_m)
+        s0 = max(0, int(np.ceil((near[i, entry, LOW] - half_step - start) / step_m)))
+        s1 = min(stations - 1, int(np.floor((near[i, entry, HIGH] + half_step - start) / step_m)))
         ball = near[i, entry, ROUND]
         for s in range(s0, s1 + 1):
             along = start + s * step_m
+            if half_step > 0.0:
+                along = nearest_along(near[i, entry], sight.reach[i], along, half_step, step_m)
             left = lane + profile[s, 0]
             up = height + profile[s, 1]
             if left < near[i, entry, LOW + 1] or left > near[i, entry, HIGH + 1]:
@@ -252,11 +315,15 @@ def take_solids(
                     near[i, entry, SIGMAS],
                     need,
                 )
+                if short > 0.0:
+                    distance = math.sqrt(x * x + y * y + z * z) - near[i, entry, RADIUS]
             else:
                 short, g0, g1, distance = shortfall(
                     solids, found[i, entry], frame, along, left, up, covariance, k, need
                 )
             missing[s] = max(missing[s], short)
+            if short > 0.0 and distance < sight.radius_m:
+                missing[s] = max(missing[s], TOUCHING_M)
             if weight <= 0.0 or short <= 0.0:
                 continue
             if level and near[i, entry, ROUND] > 0.0 and near[i, entry, RADIUS] >= LARGE_M:

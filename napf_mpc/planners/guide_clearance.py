@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 
 LARGE_M = 8.0
 """Radius from which a sphere in the air is passed like a building: by a way under it, if one is found."""
+TOUCHING_M = 2.0
+"""A place where a UAV would touch counts as this short at least [m]. With errors of centimetres no place is
+far inside the margin of a thin wall or a row of poles: the way through would be cheaper than that round."""
 ENDLESS_M = 1e4
 """Heights beyond this count as this when a solid's box is turned into the path's frame."""
 
@@ -127,6 +130,29 @@ def is_round(near: Array, i: int, entry: int, up: float) -> bool:
     if near[i, entry, ROUND] != 0.0:
         return bool(near[i, entry, ROUND] > 0.0)
     return bool(min(near[i, entry, LID] - up, up - near[i, entry, BOTTOM]) >= near[i, entry, RADIUS])
+
+
+@compiled_bare
+def half_step_of(row: Array, reach: float, step_m: float) -> float:
+    """How far back and forth a place stands for its piece of the path, next to a solid of `Sight.near`.
+
+    Next to something thin the nearest point of half a step is taken, so that nothing is missed between
+    stations. So it is next to an edge, as far as the reach is less than a step: a way that is aside one
+    station later than a face begins would cut the corner in between.
+    """
+    if 0.5 * (row[HIGH] - row[LOW]) < step_m:
+        return 0.5 * step_m
+    return min(0.5 * step_m, max(step_m - reach, 0.0)) if row[ROUND] < 0.0 else 0.0
+
+
+@compiled_bare
+def nearest_along(row: Array, reach: float, station: float, half_step: float, step_m: float) -> float:
+    """Place along the path, within half a step of a station, that is nearest to a solid."""
+    low, high = row[LOW] + reach, row[HIGH] - reach
+    if 0.5 * (row[HIGH] - row[LOW]) < step_m:
+        low = high = 0.5 * (row[LOW] + row[HIGH])
+    nearest = min(max(station, low), high)
+    return float(min(max(nearest, station - half_step), station + half_step))
 
 
 @compiled_bare

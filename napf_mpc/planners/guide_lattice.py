@@ -23,9 +23,12 @@ from napf_mpc.planners.guide_clearance import (
     ROUND,
     SIGMAS,
     TOUCHED,
+    TOUCHING_M,
     UP,
     Sight,
+    half_step_of,
     is_round,
+    nearest_along,
     shortfall,
 )
 
@@ -53,7 +56,7 @@ def list_here(sight: Sight, i: int, lattice: Lattice) -> None:
     for s in range(lattice.stations):
         sight.here_count[i, s] = 0
     for entry in range(sight.solid_count[i]):
-        half_step = _half_step(near[i, entry, LOW], near[i, entry, HIGH], lattice.step_m)
+        half_step = half_step_of(near[i, entry], sight.reach[i], lattice.step_m)
         low = near[i, entry, LOW] - half_step - sight.along[i]
         high = near[i, entry, HIGH] + half_step - sight.along[i]
         s0 = max(0, int(np.ceil(low / lattice.step_m)))
@@ -65,16 +68,6 @@ def list_here(sight: Sight, i: int, lattice: Lattice) -> None:
         for v in range(sight.known.shape[2]):
             sight.known[i, s, v, 0] = 0
             sight.known[i, s, v, 1] = -1
-
-
-@compiled_bare
-def _half_step(low: float, high: float, step_m: float) -> float:
-    """How far back and forth a place stands for its piece of the path, next to what reaches so far.
-
-    Next to something thin the nearest point of half a step is taken, so that nothing is missed between
-    stations.
-    """
-    return 0.5 * step_m if 0.5 * (high - low) < step_m else 0.0
 
 
 @compiled_bare
@@ -118,10 +111,9 @@ def cover(
             if up < near[i, entry, LOW + 2] or up > near[i, entry, HIGH + 2]:
                 continue
             at = station
-            half_step = _half_step(near[i, entry, LOW], near[i, entry, HIGH], lattice.step_m)
+            half_step = half_step_of(near[i, entry], sight.reach[i], lattice.step_m)
             if half_step > 0.0:
-                middle = 0.5 * (near[i, entry, LOW] + near[i, entry, HIGH])
-                at = min(max(middle, station - half_step), station + half_step)
+                at = nearest_along(near[i, entry], sight.reach[i], station, half_step, lattice.step_m)
             x = at - near[i, entry, ALONG]
             z = near[i, entry, ROUND] * (up - near[i, entry, UP])
             if near[i, entry, ROUND] >= 0.0:
@@ -142,14 +134,18 @@ def cover(
                     if a <= z1:
                         _fill_round(
                             missing, i, s, v, a, z1, y0, cell, x, z, near[i, entry, RADIUS],
-                            near[i, entry, TOUCHED], turned, near[i, entry, SIGMAS], need,
+                            near[i, entry, TOUCHED], turned, near[i, entry, SIGMAS], need, sight.radius_m,
                         )  # fmt: skip
                 continue
             for c in range(c0, c1 + 1):
                 if k0 <= c <= k1:
                     continue
                 place = lane + (c - half) * cell
-                short = shortfall(solids, found[i, entry], frame, at, place, up, covariance[i], k, need)[0]
+                short, _, _, distance = shortfall(
+                    solids, found[i, entry], frame, at, place, up, covariance[i], k, need
+                )
+                if distance < sight.radius_m:
+                    short = max(short, TOUCHING_M)
                 missing[i, s, v, c] = max(missing[i, s, v, c], short)
 
 
@@ -170,6 +166,7 @@ def _fill_round(
     turned: Array,
     k: float,
     need_m: float,
+    radius_m: float,
 ) -> None:
     """Take a round solid into the shortfalls of a row's cells c0 ... c1; the first is y0 + c0 cells away."""
     k0 = turned[i, 0, 0] * x * x + turned[i, 2, 2] * z * z + 2.0 * turned[i, 0, 2] * x * z
@@ -186,7 +183,10 @@ def _fill_round(
         y = y0 + cell_m * np.float64(np.int64(c))
         square = flat + y * y
         variance = (k0 + y * (k1 + y * k2)) / square if square > 1e-18 else touched
-        short = need_m + k * math.sqrt(max(variance, 0.0)) - (math.sqrt(square) - radius)
+        distance = math.sqrt(square) - radius
+        short = need_m + k * math.sqrt(max(variance, 0.0)) - distance
+        if distance < radius_m:
+            short = max(short, TOUCHING_M)
         missing[ui, us, uv, c] = max(missing[ui, us, uv, c], short)
 
 

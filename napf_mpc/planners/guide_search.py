@@ -20,6 +20,7 @@ from napf_mpc.planners.guide_band import (
     add_neighbour,
     add_row,
     band_price,
+    mend,
     smooth_terms,
     solve_band,
     take_solids,
@@ -377,6 +378,9 @@ def _plan_on(
                 _refine(chosen, lattice.fine, draft_mean)
                 continue
             _refine(chosen, lattice.fine, trial[i])
+            # Who reaches farther than a step has been asked about all there is in between.
+            if is_short[i] and reach[i] < lattice.step_m:
+                mend(sight, i, chosen, lattice.fine, step, trial[i])
             for a in range(2):
                 start[i, a] = offset[i, a]
                 if stuck and abs(chosen[0, a] - offset[i, a]) > lattice.cell_m:
