@@ -241,6 +241,36 @@ def test_a_deep_block_is_gone_round_at_its_margin_without_a_hold(width_m: float)
     assert max(guide.breach_m.max() for guide in guides) < 0.1
 
 
+def test_a_small_margin_is_kept_between_two_stations_without_a_hold() -> None:
+    """A block that begins between two of them, which are farther apart than 0.86 m reach: its corner was cut
+    by 1 m, and the formation held before it with free space all round.
+    """
+    made = guidance([Box((61.0, -4.0, 0.0), (4.0, 24.0, ENDLESS))])
+    places, guides = follow(made, until_m=100.0, sigma=0.02)
+    assert places[-1][:, 0].min() >= 100.0
+    assert Passage.HOLD not in reasons(guides)
+    assert max(guide.breach_m.max() for guide in guides) < 0.1
+
+
+def test_a_way_that_is_steep_where_the_uav_is_does_not_keep_it_waiting() -> None:
+    """A UAV in a hold waits to be where its way is: its way beside it, not at the station behind it."""
+    step_m, way = 1.0, np.zeros((1, 1, 6, 2))
+    way[0, 0, :, 0] = 0.9 * np.arange(6.0)
+    past, offset = np.array([[3.0]]), np.array([[[2.7, 0.0]]])
+    found = np.empty((4, 1))
+    none, ahead_m = np.array([np.inf]), step_m * np.arange(6.0)
+    _measure(np.zeros((1, 1, 6)), way, past, offset, ahead_m, 0.5, none, none, 2, step_m, *found)
+    assert found[2, 0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_of_a_small_margin_no_more_than_its_half_is_let_go_after_a_hold() -> None:
+    """A gap of 0.3 m for UAVs of 0.6: with a sigma of 2 cm a breach of 0.8 m would be its walls."""
+    made = guidance(gap(0.3))
+    places, guides = follow(made, sigma=0.02)
+    assert (guides[-1].reason == Passage.NO_PASSAGE).all()
+    assert places[-1][:, 0].max() < 60.0
+
+
 def test_the_way_across_makes_up_for_what_a_corner_lacks() -> None:
     """Corner at the origin, places behind it and beside: exactly the distance that is kept, and no more."""
     for along, left in ((1.0, 0.8), (2.0, 0.9), (0.0, 1.0), (1.9, 1.2)):
@@ -709,17 +739,27 @@ def test_what_is_decided_from_is_measured_as_arrays_would() -> None:
     missing[2] = 0.05
     profiles, offset = rng.normal(size=(runs, 4, stations, 2)), rng.normal(size=(runs, 4, 2))
     ahead_m, few, many = step_m * np.arange(float(stations)), rng.uniform(0.1, 0.3, runs), np.full(runs, 1.0)
+    past = rng.uniform(0.0, 4.0 * step_m, (runs, 4))
+    there = np.array(
+        [
+            [
+                [np.interp(past[run, uav], ahead_m, profiles[run, uav, :, a]) for a in range(2)]
+                for uav in range(4)
+            ]
+            for run in range(runs)
+        ]
+    )
     breach = np.maximum(missing - 0.1, 0.0)
     worse = breach - np.maximum(breach[..., 0], breach[..., 1])[..., None]
     pieces = np.diff(profiles[:, :, :bends], axis=2) / step_m
     wanted = [
         *(np.where(worse > t[:, None, None], ahead_m, np.inf).min((-1, -2)) for t in (few, many)),
-        np.abs(profiles[:, :, 0] - offset).max((-1, -2)),
+        np.abs(there - offset).max((-1, -2)),
         np.sqrt(pieces[..., 0] ** 2 + pieces[..., 1] ** 2).max((-1, -2)),
     ]
     found = np.empty((4, runs))
-    _measure(missing, profiles, offset, ahead_m, 0.1, few, many, bends, step_m, *found)
-    np.testing.assert_array_equal(found, wanted)
+    _measure(missing, profiles, past, offset, ahead_m, 0.1, few, many, bends, step_m, *found)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
     assert np.isinf(found[:2, 2]).all()
     assert np.isfinite(found[:2, :2]).all()
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from napf_mpc.constraints.passage import half_space_margins
 from napf_mpc.formation import PathFrame
 from napf_mpc.planners.guide_clearance import (
+    TOUCHING_M,
     Sight,
     frame_of,
     gather,
@@ -132,10 +133,15 @@ def all_missing(sight: Sight, shapes: list[Shape], path: PathFrame, i: int) -> A
         at = sight.along[i] + s * LATTICE.step_m
         if boxes.high[solid, 0] - middle + sight.reach[i] < LATTICE.step_m:
             at = np.clip(middle, at - 0.5 * LATTICE.step_m, at + 0.5 * LATTICE.step_m)
+        elif isinstance(shapes[solid], Box):
+            # Beside an edge a place stands for what is between it and the next, unless its reach is a step.
+            part = min(0.5 * LATTICE.step_m, max(LATTICE.step_m - sight.reach[i], 0.0))
+            nearest = np.clip(at, boxes.low[solid, 0], boxes.high[solid, 0])
+            at = np.clip(nearest, at - part, at + part)
         for v, c in product(range(LAYERS), range(CELLS)):
             left = LANE[0] + (c - LATTICE.half) * LATTICE.cell_m
             up = LANE[1] + (v - BELOW) * LATTICE.layer_m
-            short = shortfall(
+            short, _, _, distance = shortfall(
                 sight.solids,
                 solid,
                 sight.frame,
@@ -145,7 +151,9 @@ def all_missing(sight: Sight, shapes: list[Shape], path: PathFrame, i: int) -> A
                 sight.covariance[i],
                 sight.margins.k,
                 sight.need_m,
-            )[0]
+            )
+            if distance < sight.radius_m:
+                short = max(short, TOUCHING_M)
             out[s, v, c] = max(out[s, v, c], short)
     return out
 
