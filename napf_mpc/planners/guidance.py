@@ -295,10 +295,7 @@ class Guidance:
         k = max(self._inflation.k, settings.measured_k) if measured else self._inflation.k
         margin = k * sigma
         scale = np.maximum(1.0, margin / settings.usual_margin_m) ** settings.tolerance_power
-        # Of errors of centimetres that would be more than the margin; never is any of the radius let go.
-        most = np.where(margin < settings.usual_margin_m, settings.breach_share * margin, np.inf)
-        few = np.minimum(settings.tolerance_m * scale, most)
-        many = np.minimum(max(settings.tolerance_m, settings.squeeze_m) * scale, most)
+        few, many = settings.tolerance_m * scale, max(settings.tolerance_m, settings.squeeze_m) * scale
         _measure(
             self._missing, self._profiles, past, offset, self.ahead_m, settings.spare_m, few, many,
             self._bends, self._step_m, distance, squeezed, aside, slope,

@@ -315,14 +315,13 @@ def take_solids(
                     near[i, entry, SIGMAS],
                     need,
                 )
-                if short > 0.0:
-                    distance = math.sqrt(x * x + y * y + z * z) - near[i, entry, RADIUS]
             else:
                 short, g0, g1, distance = shortfall(
                     solids, found[i, entry], frame, along, left, up, covariance, k, need
                 )
             missing[s] = max(missing[s], short)
-            if short > 0.0 and distance < sight.radius_m:
+            if not even and short > 0.0 and distance < sight.radius_m:
+                # Beside what is round smoothing cuts by decimetres, and plans that give way pass all the same.
                 missing[s] = max(missing[s], TOUCHING_M)
             if weight <= 0.0 or short <= 0.0:
                 continue

@@ -98,8 +98,6 @@ class GuidanceSettings:
     """Distance over which steeper pieces are slowed down for [m]."""
     tolerance_m: float = 0.2
     """Breach from which a way counts as blocked [m]."""
-    breach_share: float = 0.5
-    """Of margins k sigma below the usual no more than this share is let go, even after a hold."""
     usual_margin_m: float = 2.5
     """Tolerance and squeeze are for margins k sigma up to this [m]; beyond, they grow with its power ..."""
     tolerance_power: float = 1.8

@@ -263,8 +263,8 @@ def test_a_way_that_is_steep_where_the_uav_is_does_not_keep_it_waiting() -> None
     assert found[2, 0] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_of_a_small_margin_no_more_than_its_half_is_let_go_after_a_hold() -> None:
-    """A gap of 0.3 m for UAVs of 0.6: with a sigma of 2 cm a breach of 0.8 m would be its walls."""
+def test_walls_that_would_be_touched_are_never_let_go_after_a_hold() -> None:
+    """A gap of 0.3 m for UAVs of 0.6: with a sigma of 2 cm it lacks less than what is let go of a margin."""
     made = guidance(gap(0.3))
     places, guides = follow(made, sigma=0.02)
     assert (guides[-1].reason == Passage.NO_PASSAGE).all()
