@@ -321,7 +321,7 @@ def take_solids(
                 )
             missing[s] = max(missing[s], short)
             if not even and short > 0.0 and distance < sight.radius_m:
-                # Beside what is round smoothing cuts by decimetres, and plans that give way pass all the same.
+                # Round solids are cut by decimetres in smoothing; plans give way there all the same.
                 missing[s] = max(missing[s], TOUCHING_M)
             if weight <= 0.0 or short <= 0.0:
                 continue

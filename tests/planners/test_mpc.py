@@ -262,6 +262,16 @@ def test_with_errors_of_centimetres_a_wall_is_gone_round(speed_mps: float, deep_
     assert not flown.score.uav_contact.any()
 
 
+@pytest.mark.parametrize("run", [4, 10])
+def test_with_errors_of_centimetres_spheres_are_passed_without_giving_up(run: int) -> None:
+    """Ways smoothed beside a small sphere lack decimetres of what they want: no reason to wait for ever."""
+    errors = {"navigation.sigma_min_m": 0.02, "navigation.sigma_max_m": 0.06}
+    flown = simulate(load_problem("study_40s", errors), "qp", seed=41, runs=range(run, run + 1))
+    assert flown.score.finished.all()
+    assert not flown.score.obstacle_contact.any()
+    assert flown.score.metrics["min_clearance_m"].min() > 0.1
+
+
 def test_a_sigma_of_tens_of_metres_makes_no_lunge() -> None:
     """A wall 5 m beside, and a margin that has grown to 60 m: it is left within the limits."""
     planner = QpPlanner(problem(planner={"kind": "qp", "leaving_mps": 2.0}), guided=False)
