@@ -157,15 +157,10 @@ def fly_block(
     with threadpool_limits(1):
         scenario = build_scenario(problem, seed, runs, data_folder)
         rows, timing, trajectories, events = [], [], [], []
+        factories = None if own is None else own.planners
         for name in planners:
             began = time.perf_counter()
-            flown = _fly(
-                problem,
-                name,
-                make_planner(name, problem, None if own is None else own.planners),
-                scenario,
-                record_every,
-            )
+            flown = _fly(problem, name, make_planner(name, problem, factories), scenario, record_every)
             timing.append(timing_row(name, runs, time.perf_counter() - began))
             rows.append(score_rows(name, seed, flown.score, flown.tally))
             events.append(flown.tally.event_columns(name, runs.start))

@@ -441,8 +441,10 @@ def _measure(
                 if worse > many_m[run]:
                     squeezed[run] = min(squeezed[run], ahead_m[s])
             # The first station is up to a step behind: on a steep way that is metres aside.
-            lower = min(int(past[run, uav] / step_m), way.shape[0] - 2)
-            part = past[run, uav] / step_m - lower
+            # At places that no UAV can be at, rounding of its station is larger than all of the way.
+            stations = min(max(past[run, uav] / step_m, 0.0), way.shape[0] - 1.0)
+            lower = min(int(stations), way.shape[0] - 2)
+            part = stations - lower
             for a in range(2):
                 there = (1.0 - part) * way[lower, a] + part * way[lower + 1, a]
                 aside[run] = max(aside[run], abs(there - offset[run, uav, a]))

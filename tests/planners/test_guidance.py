@@ -263,6 +263,28 @@ def test_a_way_that_is_steep_where_the_uav_is_does_not_keep_it_waiting() -> None
     assert found[2, 0] == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.parametrize("past_m", [-1e14, 1e14, 1e300])
+def test_a_place_beyond_all_measure_is_compared_with_an_end_of_the_way(past_m: float) -> None:
+    """A fix of 1e30 m: its station is off by more than the way is long, and must not be looked up in it."""
+    way, offset = np.zeros((1, 1, 6, 2)), np.zeros((1, 1, 2))
+    way[0, 0, :, 0] = np.arange(6.0)
+    found, none = np.empty((4, 1)), np.array([np.inf])
+    _measure(
+        np.zeros((1, 1, 6)),
+        way,
+        np.array([[past_m]]),
+        offset,
+        np.arange(6.0),
+        0.5,
+        none,
+        none,
+        2,
+        1.0,
+        *found,
+    )
+    assert found[2, 0] == (0.0 if past_m < 0.0 else 5.0)
+
+
 def test_walls_that_would_be_touched_are_never_let_go_after_a_hold() -> None:
     """A gap of 0.3 m for UAVs of 0.6: with a sigma of 2 cm it lacks less than what is let go of a margin."""
     made = guidance(gap(0.3))
